@@ -63,7 +63,10 @@ class RowAssembler(TrackedVelocities):
         is_hard = limits.relax_acceleration or settings.dynamics is not None
         self._hard = (x.hard_lower, x.hard_upper) if is_hard else (x.lower, x.upper)
         self._packed: Any = kernels.pack(x)
-        self._contacts, self.dynamics = contacts, settings.dynamics
+        self.dynamics = settings.dynamics
+        own = None if self.dynamics is None else self.dynamics.contacts
+        self.contacts = self._contacts = own or (None if contacts is None else contacts.own_copy())
+        """Frames that rest, and which of them do now; None without any."""
         if self.dynamics is not None:
             self.dynamics.lay_out(x)
         self._scene = scene

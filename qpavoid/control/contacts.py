@@ -8,6 +8,7 @@ limits; hard joint limits are kept as well, and where those leave no velocity th
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
+from copy import copy
 from pathlib import Path
 
 import numpy as np
@@ -19,9 +20,29 @@ from qpavoid.kernels.rotation import rotation_vector
 from qpavoid.model.kinematics import ForwardKinematics
 from qpavoid.model.robot import Robot
 from qpavoid.problem import Array, Contacts, IntArray
+from qpavoid.reason import Reason, ReasonKind
 
+_NO_BACKUP = Reason.of(
+    ReasonKind.NO_BACKUP, "contacts", detail="backup trajectories do not hold contacts: avoidance.backup"
+)
+"""Assumption where obstacles move and the robot stands on something."""
 _CORRECTION = 0.02
 """Largest speed at which what has slid is put right [m/s, rad/s]."""
+
+
+def within_contacts(
+    avoidance: config.Avoidance, has_contacts: bool, has_torques: bool
+) -> tuple[config.Avoidance, tuple[Reason, ...]]:
+    """Return the block as far as it goes with contacts, and what to assume where obstacles move.
+
+    Backup trajectories do not hold contacts. At the torque level, the stop that the look-ahead counts on is one of
+    accelerations that all joints could have at once whatever the rest does: a tenth of those that one has.
+    """
+    if not has_contacts:
+        return avoidance, ()
+    reasons = (_NO_BACKUP,) if avoidance.backup else ()
+    look_ahead = avoidance.look_ahead and not has_torques
+    return avoidance.model_copy(update={"backup": False, "look_ahead": look_ahead}), reasons
 
 
 class ContactRows:
@@ -43,11 +64,14 @@ class ContactRows:
 
     def own_copy(self) -> ContactRows:
         """Return the same contacts, which come and leave by themselves."""
-        own = object.__new__(ContactRows)
-        own.__dict__.update(self.__dict__)
-        own._anchors, own.shares = list(self._anchors), self.shares.copy()
-        own._rates, own._comes = self._rates.copy(), self._comes.copy()
+        own = copy(self)
+        own.take_over(self)
         return own
+
+    def take_over(self, other: ContactRows) -> None:
+        """Let contacts rest, come and leave as other ones of the same frames do."""
+        self._anchors, self.shares = list(other._anchors), other.shares.copy()
+        self._rates, self._comes = other._rates.copy(), other._comes.copy()
 
     @property
     def active(self) -> IntArray:

@@ -11,6 +11,7 @@ import pinocchio as pin
 
 from qpavoid import config, kernels
 from qpavoid.control.contacts import ContactRows
+from qpavoid.control.observer import MomentumObserver
 from qpavoid.dynamics import StepDynamics
 from qpavoid.errors import ConfigError, require_known
 from qpavoid.kernels.layout import RowLayout
@@ -31,11 +32,16 @@ _IDENTITY = 1e-9
 """Residual of M a + h - rnea, over the size of the latter, that is round-off [-]."""
 
 
+Reasons = tuple[Reason, ...]
+
+
 class RobotDynamics:
     """Mass matrix, bias torques and gravity of a robot, its torque limits, and what kernels make of them."""
 
     packed: Any
     """`DynamicsArrays` in compiled code, once `lay_out` was called."""
+    contacts: ContactRows | None = None
+    """Frames that rest, of a base that floats."""
     _mirrors = True
 
     def __init__(
@@ -70,6 +76,13 @@ class RobotDynamics:
         self.approaches: Mask = np.ones(1, dtype=bool)
         """(1,) whether the tracked velocity is approached at the tracking rate, or taken as it is."""
         self._has_torques, self._acceleration = bool(np.isfinite(self.limit).all()), bounds.acceleration
+        names, units = tuple(robot.coordinate_names), tuple(robot.coordinate_units)
+        self.observer = (
+            None if settings.observer is None else MomentumObserver(self._model, settings.observer, names, units)
+        )
+        """What acts on the robot from outside; None where it is not asked for."""
+        self._last_torque, self._touches = np.zeros(n), tuple[Reason, ...]()
+        self._first_touches = self._touches
         self._check(robot.home)
         self.bounds = replace(bounds, acceleration=self._references(robot.home))
         """Limits of the joints; the accelerations, on which braking counts, are overwritten by every step."""
@@ -151,6 +164,20 @@ class RobotDynamics:
         """Take up contacts, see `StandingDynamics`; a fixed base has none."""
         raise NotImplementedError
 
+    def observe(self, q: Array, v: Array) -> None:
+        """Let the observer see a measured state of a step, after the torques of the step before."""
+        if self.observer is not None:
+            self._touches = self.observer.update(q, v, self._last_torque, self._dt)
+
+    def touched(self, faults: Reasons, assumptions: Reasons) -> tuple[Reasons, Reasons]:
+        """Return faults and assumptions of a step with what touches the robot, where that stops it among the faults."""
+        if self.observer is None or not (self._touches or self.observer.is_touched):
+            return faults, assumptions
+        if not self.observer.stops:
+            return faults, assumptions + self._touches
+        self._first_touches = self._touches or self._first_touches
+        return faults + self._first_touches, assumptions
+
     def rows(self, v_measured: Array) -> StepDynamics | None:
         """Return dynamics and rows of the last step, at the measured velocity (nv,)."""
         J, b = self._rows
@@ -188,6 +215,9 @@ class RobotDynamics:
             solution = solution._replace(v=v_measured + self._dt * x.change).with_reasons(*reasons)
         elif excess > 0.0:
             np.clip(x.torque, -x.limit, x.limit, out=x.torque)
+        if self.observer is not None:
+            self._last_torque[self.actuated] = x.torque
+            solution = solution._replace(external=self.observer.residual.copy())
         return tuple.__new__(Solution, (*solution[:-4], x.torque.copy(), x.change.copy(), *solution[-2:]))
 
 

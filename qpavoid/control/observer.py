@@ -42,6 +42,8 @@ class MomentumObserver:
         self._largest: Array | None = None
         self.is_touched = False
         """Whether a residual has been beyond its threshold since the last `reset`."""
+        self.stops = settings.stop
+        """Whether a robot that is touched brakes, and rests until `reset`."""
         self.reset()
 
     def reset(self) -> None:

@@ -7,8 +7,6 @@ all bounded laws that hold contacts, their relaxation and their priorities are u
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import pinocchio as pin
 
@@ -61,14 +59,16 @@ class StandingDynamics(RobotDynamics):
             ConfigError: see `RobotDynamics`; or a surface has no corners, or all of them cannot carry any wrench.
         """
         n = robot.model.nv
-        self._contacts = contacts
+        self.contacts = self._contacts = contacts.own_copy()
         self._full, self._bias = np.zeros((n, n)), np.zeros(n)
         self._x: RowLayout | None = None
         self._lay_points()
+        if settings.observer is not None:
+            raise ConfigError(
+                "dynamics.observer: of a robot on contacts, forces of the ground are not known; leave it out"
+            )
         super().__init__(robot, settings.model_copy(update={"holding_fraction": None}), bounds, dt, row_gain)
         self._M[:] = np.eye(n)
-        self.forces: dict[str, Array] = {}
-        """Forces (k, 3) of the ground on the contact points of each frame in the last step, world axes [N]."""
         self._solved: tuple[Array, Array] | None = None
         self._is_held = False
         self._weight = 9.81 * float(pin.computeTotalMass(robot.model))
@@ -276,8 +276,10 @@ class StandingDynamics(RobotDynamics):
         v, p = answer
         change = (v - v_measured) / self._dt
         torque = (self._full[BASE:] @ change + self._bias[BASE:]) - self._Jp[:, BASE:].T @ p / self._dt
-        self._note_forces(p)
-        return _with_torque(solution._replace(v=v), np.clip(torque, -self.limit, self.limit), change)
+        forces, settings = p.reshape(-1, 3) / self._dt, self._contacts.settings
+        by_frame = {settings[i].frame: forces[self._used == i] for i in np.unique(self._used).tolist()}
+        torque = np.clip(torque, -self.limit, self.limit)
+        return solution._replace(v=v, torque=torque, acceleration=change, forces=by_frame)
 
     def _nearest(self, v: Array) -> tuple[Array, Array] | None:
         """Return the velocity (nv,) nearest to another one that torques and cones allow, and its impulses, if any."""
@@ -301,25 +303,13 @@ class StandingDynamics(RobotDynamics):
         v = self._x.v_stop.copy()
         change = (v - self._v) / self._dt
         torque = np.clip(self._M[BASE:] @ change + self._h[BASE:], -self.limit, self.limit)
-        self.forces = {}
         reasons = solution.reasons if _not_held().key in {reason.key for reason in solution.reasons} else (
             *solution.reasons, _not_held()
         )  # fmt: skip
-        return _with_torque(solution._replace(v=v, status=Status.STOPPED, reasons=reasons), torque, change)
-
-    def _note_forces(self, p: Array) -> None:
-        """Keep the forces of impulses p (m,) [N s], by frame."""
-        forces, settings = p.reshape(-1, 3) / self._dt, self._contacts.settings
-        self.forces = {settings[i].frame: forces[self._used == i] for i in np.unique(self._used).tolist()}
+        return solution._replace(v=v, status=Status.STOPPED, reasons=reasons, torque=torque, acceleration=change)
 
 
 def _not_held() -> Reason:
     return Reason.of(
         ReasonKind.CONTACTS_INFEASIBLE, "contacts", detail="nor do torques within their limits and forces within cones"
     )
-
-
-def _with_torque(solution: Solution, torque: Array, acceleration: Array) -> Solution:
-    """Return a solution with its torques and acceleration."""
-    fields: dict[str, Any] = {"torque": torque, "acceleration": acceleration}
-    return solution._replace(**fields)
