@@ -107,7 +107,7 @@ class Contacts(NamedTuple):
     """(c,) velocity of these frames that corrects their sliding [m/s, rad/s]."""
 
     def project(self, v: Array) -> Array:
-        """Return the velocity (nv,) closest to v (nv,) with J v = b: v itself if it meets that to `CONTACT_TOLERANCE`."""
+        """Return the velocity (nv,) closest to v with J v = b: v itself if it meets that to `CONTACT_TOLERANCE`."""
         if np.abs(self.J @ v - self.b).max(initial=0.0) <= CONTACT_TOLERANCE:
             return v
         return np.asarray(self.v_particular + self.Z @ (self.Z.T @ v))

@@ -297,7 +297,8 @@ def _with_armature(robot: Robot, armature: Any) -> Any:
         return robot.model
     model: Any = robot.model.copy()
     values = np.array(model.armature)
-    given = armature if isinstance(armature, dict) else dict.fromkeys(robot.joint_names, armature)
+    joints = [name for name in robot.joint_names if model.joints[model.getJointId(name)].nv == 1]  # a base has none
+    given = armature if isinstance(armature, dict) else dict.fromkeys(joints, armature)
     for name, value in given.items():
         require_known(name, robot.joint_names, "dynamics.armature: no joint")
         joint = model.joints[model.getJointId(name)]
