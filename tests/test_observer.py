@@ -7,7 +7,8 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from qpavoid.config import Observer, PlantSettings, Push
+from qpavoid import Controller, build_scene, build_tasks
+from qpavoid.config import Dynamics, Observer, PlantSettings, Push, Task
 from qpavoid.control.observer import MomentumObserver
 
 pytest.importorskip("mujoco")
@@ -89,3 +90,26 @@ def test_pushes_are_found_and_free_motion_is_not(panda, model, mass_scale):
         delays.append(round(1e3 * (found[0][0] - 1.5)) if found else None)
     print(f"\nmasses {mass_scale}: thresholds {np.round(threshold, 2)} Nm, found after {delays} ms")
     assert None not in delays and min(delays) >= 0 and max(delays) <= 32
+
+
+def test_controller_observes_and_stops(panda):
+    """Touched beyond its threshold, the robot brakes and rests until `reset`, and says which joint it was."""
+    observer = Observer(stop=True, threshold=dict.fromkeys(panda.coordinate_names, 3.0))
+    tasks = build_tasks([Task(frame=TOOL)], panda, panda.home)
+    dynamics = Dynamics(armature=0.1, observer=observer)
+    controller = Controller(build_scene(panda), tasks, dt=DT, dynamics=dynamics)
+    push = Push(frame=TOOL, force=(0.0, 20.0, 0.0), start=0.05, duration=0.05)
+    plant, statuses = TorquePlant(panda, panda.home, PlantSettings(armature=0.1, pushes=[push])), []
+    for k in range(150):
+        q, v = plant.measure()
+        solution = controller.step(q, k * DT, v=v)
+        statuses.append(solution.status.value)
+        if "STOPPED" in statuses and statuses[-2] == "SOLVED":
+            assert "TOUCHED" in {reason.kind.value for reason in solution.reasons}
+            assert np.abs(solution.external).max() > 3.0
+        plant.apply(solution.torque, DT)
+    first = statuses.index("STOPPED")
+    assert 50 < first < 70 and set(statuses[:first]) == {"SOLVED"} and set(statuses[first:]) == {"STOPPED"}
+    assert np.abs(plant.v).max() < 0.01 and controller.observer.is_touched
+    controller.reset()
+    assert controller.step(plant.q, 0.0, v=plant.v).status.value == "SOLVED"

@@ -7,6 +7,7 @@ from typing import Any
 
 from qpavoid.control.builder import ProblemBuilder
 from qpavoid.control.distances import DistanceQuery
+from qpavoid.control.observer import MomentumObserver
 from qpavoid.control.obstacle_states import ObstacleStates
 from qpavoid.errors import ConfigError, UnknownName, nearest
 from qpavoid.model.sample import Sample
@@ -142,6 +143,12 @@ class SceneChanges:
     def obstacle_states(self) -> ObstacleStates:
         """States of all obstacles in the last step; the next one overwrites them."""
         return self._builder.tracker.current
+
+    @property
+    def observer(self) -> MomentumObserver | None:
+        """What observes torques from outside; None unless `dynamics.observer` asks for it."""
+        dynamics = self._builder.rows.dynamics
+        return None if dynamics is None else dynamics.observer
 
     def set_contacts(self, frames: Collection[str], duration: float = 0.1) -> None:
         """Let the contacts of some frames come or stay, and all others leave.
