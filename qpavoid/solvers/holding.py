@@ -21,6 +21,7 @@ _AT_LIMIT = 1e-5
 _AT_EDGE = 1e-7
 """Distance of a force from the edge of its cone below which it is there [N s, scaled]."""
 _ROWS_PER_POINT = 6
+"""Rows of the cone of a contact point, see `kernels.cone_rows`."""
 
 Bounds = tuple[Array, Array]
 """Lower and upper bound (nv,) on v [rad/s or m/s]."""
@@ -76,6 +77,6 @@ def dynamics_reasons(v: Array, problem: Problem, severity: Severity) -> list[Rea
         j, torque = x.actuated[r], float(x.torque(v)[r])
         unit = "Nm" if units[j] == "rad" else "N"
         reasons.append(Reason.of(ReasonKind.AT_TORQUE_LIMIT, names[j], amount=torque, unit=unit, severity=severity))
-    at_edge = cones.reshape(len(x.points), -1).max(axis=1, initial=-np.inf) > -_AT_EDGE
+    at_edge = cones.reshape(-1, _ROWS_PER_POINT).max(axis=1, initial=-np.inf) > -_AT_EDGE
     frames = dict.fromkeys(x.points[i] for i in np.flatnonzero(at_edge))
     return reasons + [Reason.of(ReasonKind.AT_FRICTION_LIMIT, frame, severity=severity) for frame in frames]
