@@ -41,7 +41,7 @@ from qpavoid.kernels.planning_search import search
 from qpavoid.kernels.pose_fit import extrapolate_states
 from qpavoid.kernels.prediction import Prediction, predict, prediction_error_bound
 from qpavoid.kernels.qp import max_clearance_velocity, minimize, project, project_soft
-from qpavoid.kernels.ramps import RampLimits, follow_ramp
+from qpavoid.kernels.ramps import RampLimits, follow_ramp, velocity_towards
 from qpavoid.kernels.rollout import RolloutArrays, advance_rollout, begin_rollout, rollout_outcome
 from qpavoid.kernels.rotation import rotation_vector
 from qpavoid.kernels.rows import alpha, beta, distance_rows, row_bounds
@@ -150,6 +150,7 @@ __all__ = [
     "tracking_violation",
     "update_kinematics",
     "velocity_bounds",
+    "velocity_towards",
     "violation",
     "voxels_within",
     "write_path_point",

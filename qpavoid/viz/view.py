@@ -289,6 +289,7 @@ def page_setup(
     title: str,
     q: Array | None = None,
     planned: Sequence[Array] = (),
+    nearby: Array | None = None,
 ) -> PageSetup:
     """Return the setup of a page.
 
@@ -299,6 +300,7 @@ def page_setup(
         title: shown above the controls.
         q: configuration (nq,) in which the camera sees the whole robot; the home pose if left out.
         planned: paths (n, 3) of the tools [m].
+        nearby: points (n, 3) that the camera sees as well, if they are not far away [m].
     """
     meshes = [of_obstacle(described, i) for i, described in enumerate(obstacles)]
     return PageSetup(
@@ -312,14 +314,18 @@ def page_setup(
         ],
         obstacles=[(described["name"], mesh) for described, mesh in zip(obstacles, meshes, strict=True)],
         targets=list(targets),
-        camera=_camera(robot, robot.home if q is None else q, planned),
+        camera=_camera(robot, robot.home if q is None else q, planned, nearby),
         planned=list(planned),
         joint_names=robot.coordinate_names,
         speed_limits=np.array(robot.bounds().velocity),
     )
 
 
-def _camera(robot: Robot, q: Array, planned: Sequence[Array]) -> tuple[Array, Array]:
+_FAR = 1.5
+"""Distance from the robot from which on an obstacle is not looked at [m]."""
+
+
+def _camera(robot: Robot, q: Array, planned: Sequence[Array], nearby: Array | None) -> tuple[Array, Array]:
     """Return where to look at a robot and its paths from, and the point in the middle of the picture (3,) [m]."""
     model, data = robot.model, robot.model.createData()
     pin.forwardKinematics(model, data, q)
@@ -327,6 +333,8 @@ def _camera(robot: Robot, q: Array, planned: Sequence[Array]) -> tuple[Array, Ar
         np.zeros(3)
     ]
     points += [point for path in planned for point in path]
+    middle = np.mean(points, axis=0)
+    points += [point for point in (() if nearby is None else nearby) if np.linalg.norm(point - middle) < _FAR]
     lower, upper = np.min(points, axis=0), np.max(points, axis=0)
     size = max(float(np.linalg.norm(upper - lower)), 0.3)
     look_at = 0.5 * (lower + upper)

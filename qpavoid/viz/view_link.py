@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import pickle
 import socket
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
@@ -14,6 +14,8 @@ from typing import Any, NamedTuple
 import numpy as np
 import pinocchio as pin
 
+from qpavoid.config import Avoidance
+from qpavoid.control.tasks import RowTask, in_order
 from qpavoid.control.tick import Tick
 from qpavoid.errors import ConfigError
 from qpavoid.model.robot import Robot
@@ -93,6 +95,8 @@ class PageSetup:
     """Frames shown, at most [1/s]."""
     quality: str = "high"
     """`high`, or `low` for machines without a graphics processor."""
+    waiting: str = ""
+    """What is shown, with the seconds that have gone by, until the first frame has a status; in plain text."""
     parent: int = 0
     """Process whose end ends the page."""
 
@@ -177,6 +181,16 @@ def frame_of(tick: Tick, robot: Robot, obstacle_of_pair: IntArray, text: str = "
 
 
 _NONE = np.zeros(0)
+
+
+def still_frame(scene: Scene, tasks: Sequence[RowTask], q: Array, avoidance: Avoidance) -> Frame:
+    """Return what is shown before there is a control step: the scene at t = 0, and no status."""
+    targets = [task.motion.sample(0.0).row[:12] for task in in_order(tasks)[0]]
+    obstacles = [obstacle.motion.sample(0.0).row[:12] for obstacle in scene.slots]
+    return Frame(
+        0.0, q, np.zeros(scene.robot.model.nv), np.zeros((0, 8)), np.zeros((0, 3)), np.reshape(targets, (-1, 12)),
+        np.reshape(obstacles, (-1, 12)), np.array([avoidance.d1, avoidance.d2]), np.empty((0, 2 + len(q))), _NONE,
+    )  # fmt: skip
 
 
 def obstacles_of_pairs(scene: Scene) -> IntArray:
