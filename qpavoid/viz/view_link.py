@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import pickle
 import socket
+import struct
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
@@ -61,7 +62,7 @@ class Frame(NamedTuple):
     touching: Array
     """(b,) numbers of the robot's bodies that touch something."""
     text: str = ""
-    """Status, in HTML."""
+    """Status, in HTML; empty where it is the one before."""
 
 
 @dataclass
@@ -161,7 +162,9 @@ def frame_of(tick: Tick, robot: Robot, obstacle_of_pair: IntArray, text: str = "
     near, closest = tick.problem.avoidance, tick.proximity.closest
     # the gains take distances with an offset, the same of all pairs but for those with a safety distance of their own
     offset = float(np.sort(near.d - closest[:, 0])[len(closest) // 2]) if 0 < len(near.d) == len(closest) else 0.0
-    witnesses: Array = np.column_stack((closest[:, [0, 4, 5, 6, 7, 8, 9]], obstacle_of_pair[tick.proximity.pair]))
+    witnesses: Array = np.empty((len(closest), 8))
+    witnesses[:, 0], witnesses[:, 1:7] = closest[:, 0], closest[:, 4:10]
+    witnesses[:, 7] = obstacle_of_pair[tick.proximity.pair]
     if len(witnesses) > MAX_WITNESSES:
         witnesses = witnesses[np.argsort(witnesses[:, 0])[:MAX_WITNESSES]]
     tools = tick.kinematics.position
@@ -211,9 +214,9 @@ _FRAME, _CHANGE = b"f", b"c"
 
 def pack(frame: Frame) -> bytes:
     """Return a frame as a datagram."""
-    parts = [np.ravel(part) for part in frame[1:10]]
-    numbers = np.concatenate([(frame.t, *map(len, parts)), *parts])
-    return _FRAME + bytes(numbers.tobytes()) + frame.text.encode()
+    parts = frame[1:10]
+    header = struct.pack(f"{_HEADER}d", frame.t, *(part.size for part in parts))
+    return b"".join((_FRAME, header, *(part.tobytes() for part in parts), frame.text.encode()))
 
 
 def pack_change(change: SlotChange) -> bytes:

@@ -66,6 +66,7 @@ def build(setup: PageSetup, link: socket.socket) -> tuple[Page, Controls, str]:
 
 def serve(setup: PageSetup, link: socket.socket, page: Page, controls: Controls) -> None:
     """Show the newest frame, again and again, while the loop's process runs."""
+    text = ""
     clients, start, is_waiting = 0, time.perf_counter(), bool(setup.waiting)
     while os.getppid() == setup.parent:
         begin, newest = time.perf_counter(), None
@@ -74,7 +75,7 @@ def serve(setup: PageSetup, link: socket.socket, page: Page, controls: Controls)
                 page.change(item)
                 controls.name_obstacles(page.obstacle_names)
             else:
-                newest = item
+                newest, text = item, item.text or text
         count = len(page.server.get_clients())
         if count != clients and send_event(link, type="clients", count=count):
             clients = count
@@ -82,6 +83,7 @@ def serve(setup: PageSetup, link: socket.socket, page: Page, controls: Controls)
             is_waiting = newest is None or not newest.text
             controls.wait(f"{setup.waiting}: {time.perf_counter() - start:.0f} s")
         if newest is not None:
+            newest = newest._replace(text=text)
             with page.server.atomic():
                 page.show(newest)
                 controls.show(newest)
