@@ -16,10 +16,17 @@ D1 = 0.03
 
 
 def play(name, fields=(), **plant):
-    """Run a scenario on motors; return its log, the least distance [m] and the figures of its motors."""
+    """Run a scenario on motors, and print its figures; return its log, the least distance [m] and its metrics."""
     log = simulate(load_scenario(name, list(fields)), plant=PlantSettings(**MOTORS, **plant))
     assert log.meta["completed"]
-    return log, float(log.body_distance[:, 1:].min()), log.metrics()
+    closest, figures = float(log.body_distance[:, 1:].min()), log.metrics()
+    print(
+        f"{name} {' '.join(fields)} {plant}: "
+        f"closest {1e3 * closest:.1f} mm, end {1e3 * figures['final_error']:.1f} mm, "
+        f"Σ|Δτ| {figures['torque']['jitter']:.0f} Nm/s, torque {100 * figures['torque']['share']:.0f} %, "
+        f"outside limits {1e3 * outside(log):.1f} mrad, {figures['status_counts']}"
+    )
+    return log, closest, figures
 
 
 def relaxed(log):

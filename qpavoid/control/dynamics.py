@@ -99,7 +99,7 @@ class RobotDynamics:
         arrays = kernels.DynamicsArrays(
             M=self._M, h=self._h, gravity=self._gravity, gravity_slope=self._gravity_slope,
             actuated=self.actuated, limit=self.limit, acceleration=self.bounds.acceleration.copy(),
-            acceleration_step=np.full(n, np.inf) if self._has_torques else self._acceleration * self._dt,
+            acceleration_step=self.bounds.acceleration * self._dt,
             braking=self.bounds.acceleration,
             rows=np.zeros((count + len(x.rhs), n)), rhs=np.zeros(count + len(x.rhs)),
             torque=np.zeros(a), change=np.zeros(n), factor=np.zeros((n, n)), approaches=self.approaches,
@@ -113,6 +113,7 @@ class RobotDynamics:
         zero = np.zeros(n)
         self._inverse = kernels.direct(kernels.inverse_dynamics, self.packed, zero, zero, self._dt)
         kernels.forward_dynamics(self.packed)
+        kernels.project_widened(np.eye(n), 1.0, zero, np.zeros((0, n)), zero[:0], *[zero - 1.0, zero + 1.0] * 2)
         kernels.slow_rows(kernels.pack(x), self.packed, 0)
 
     def step(self, packed: Any, *arguments: Any) -> Callable[..., int]:

@@ -158,6 +158,8 @@ class Arbiter:
         if result is None:
             return solution
         v, scale, violation, pair, distance = result
+        if self._rows.dynamics is not None and distance >= 0.0:
+            return solution
         if violation <= TOLERANCE:
             return solution._replace(v=v, command_scale=scale * solution.command_scale)
         names = self._settings.scene.pair_names[pair]
@@ -207,7 +209,7 @@ class Arbiter:
 
 def _clipped(problem: Problem, solution: Solution) -> Solution:
     """Clip the velocity of a `bounded` solver to the bounds that it has to keep, in case it does not."""
-    is_solved, v = solution.status is Status.SOLVED, solution.v
+    is_solved, v = solution.status is Status.SOLVED and problem.dynamics is None, solution.v
     lower, upper = (problem.lower, problem.upper) if is_solved else (problem.hard_lower, problem.hard_upper)
     within = np.minimum(np.maximum(v, lower), upper)
     if within.tobytes() == v.tobytes():
