@@ -158,7 +158,7 @@ class Arbiter:
         if result is None:
             return solution
         v, scale, violation, pair, distance = result
-        if self._rows.dynamics is not None and distance >= 0.0:
+        if _limits_torques(problem) and distance >= 0.0:
             return solution
         if violation <= TOLERANCE:
             return solution._replace(v=v, command_scale=scale * solution.command_scale)
@@ -207,9 +207,13 @@ class Arbiter:
         return solution.with_reasons(*excesses) if excesses else solution
 
 
+def _limits_torques(problem: Problem) -> bool:
+    return problem.dynamics is not None and problem.dynamics.torque_rows > 0
+
+
 def _clipped(problem: Problem, solution: Solution) -> Solution:
     """Clip the velocity of a `bounded` solver to the bounds that it has to keep, in case it does not."""
-    is_solved, v = solution.status is Status.SOLVED and problem.dynamics is None, solution.v
+    is_solved, v = solution.status is Status.SOLVED and not _limits_torques(problem), solution.v
     lower, upper = (problem.lower, problem.upper) if is_solved else (problem.hard_lower, problem.hard_upper)
     within = np.minimum(np.maximum(v, lower), upper)
     if within.tobytes() == v.tobytes():

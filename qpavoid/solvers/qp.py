@@ -77,7 +77,7 @@ class Qp(NamedSolver):
     def _bounds(self, problem: Problem) -> tuple[Array, Array]:
         """Return the bounds (nv,), (nv,); at the torque level, with accelerations passed as little as rows need."""
         lower, upper, hard = problem.lower, problem.upper, (problem.hard_lower, problem.hard_upper)
-        if problem.dynamics is None:
+        if problem.dynamics is None or not problem.dynamics.torque_rows:
             return lower, upper
         A, regularization = problem.tracking.A, self._regularization(problem)
         rows = problem.inequalities

@@ -46,7 +46,7 @@ def relax(problem: Problem, regularization: float) -> Array | None:
     rows, bounds, dynamics = problem.avoidance, (problem.lower, problem.upper), problem.dynamics
     if dynamics is not None:  # torques first, then contact, then holding, then margins
         problem = problem._replace(dynamics=dynamics.with_holding(dynamics.b[:0]))
-        bounds = problem.hard_lower, problem.hard_upper
+        bounds = (problem.hard_lower, problem.hard_upper) if dynamics.torque_rows else bounds
     closest, no_floor = partial(_closest, problem, regularization), np.full(len(rows.d), -np.inf)
     b_contact = rows.b_contact - TOLERANCE
     if bounds[0] is not problem.hard_lower and closest(rows.J, b_contact, *bounds) is None:
