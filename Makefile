@@ -9,7 +9,7 @@ run: .venv/run
 	  --solvers tracking,eq10-literal,eq10,qp --out out
 
 view: .venv/view
-	$(BIN)/qpavoid view panda_ball
+	$(BIN)/qpavoid view panda_drag
 
 figures: run
 	$(BIN)/python docs/figures/draw.py

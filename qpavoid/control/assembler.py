@@ -140,6 +140,7 @@ class RowAssembler(TrackedVelocities):
     def use_form(self, number: int) -> None:
         """Choose the form of the rows of the next steps; 0 is that of the settings."""
         self._layout, self._packed, self._step, self._views = self._forms[number]
+        self._row_count = self._layout.summary.view(np.ndarray)["rows"]
 
     def _make_form(self, layout: RowLayout) -> _Form:
         """Pack a layout."""
@@ -290,7 +291,7 @@ class RowAssembler(TrackedVelocities):
 
     def _view(self) -> tuple[Proximity, AvoidanceRows]:
         """Return what there is of the near pairs of the last step."""
-        x, k = self._layout, int(self._layout.summary["rows"][0])
+        x, k = self._layout, int(self._row_count[0])
         if k not in self._views:
             near = x.near_pairs[:k]
             proximity = Proximity(near, x.closest[:k], x.J[:k], x.feedforward[:k])

@@ -4,7 +4,6 @@ from qpavoid.kernels.approach import ApproachArrays, comes_near, extend_paths, w
 from qpavoid.kernels.backup import (
     backup_rows,
     closes_below,
-    max_offset,
 )
 from qpavoid.kernels.bounds import velocity_bounds
 from qpavoid.kernels.braking_bounds import speed_to_stop
@@ -39,8 +38,8 @@ from qpavoid.kernels.planning_search import search
 from qpavoid.kernels.pose_fit import extrapolate_states
 from qpavoid.kernels.prediction import Prediction, predict, prediction_error_bound
 from qpavoid.kernels.qp import max_clearance_velocity, minimize, project, project_soft
-from qpavoid.kernels.ramps import RampLimits, follow_ramp
-from qpavoid.kernels.rollout import RolloutArrays, advance_rollout, begin_rollout, rollout_outcome
+from qpavoid.kernels.ramps import RampLimits, follow_ramp, velocity_towards
+from qpavoid.kernels.rollout import RolloutArrays, advance_rollout, begin_rollout, offset_of_start, rollout_outcome
 from qpavoid.kernels.rotation import rotation_vector
 from qpavoid.kernels.rows import alpha, beta, distance_rows, row_bounds
 from qpavoid.kernels.step import (
@@ -112,10 +111,10 @@ __all__ = [
     "leaves_position_limits",
     "mark_own_pixels",
     "max_clearance_velocity",
-    "max_offset",
     "minimize",
     "near_pairs",
     "observe",
+    "offset_of_start",
     "pack",
     "pair_clearances",
     "place_bodies",
@@ -142,6 +141,7 @@ __all__ = [
     "tracking_violation",
     "update_kinematics",
     "velocity_bounds",
+    "velocity_towards",
     "violation",
     "voxels_within",
     "write_path_point",

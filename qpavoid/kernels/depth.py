@@ -228,6 +228,9 @@ def recall_cells(
     """
     height, width = depth.shape
     slack, planes = 0.5 * np.sqrt(3.0) * resolution, _planes_in_camera(bodies)
+    centers = np.empty((len(bodies.core), 3))
+    for b in range(len(centers)):
+        centers[b, 0], centers[b, 1], centers[b, 2] = _center(bodies.poses[b], bodies.sphere[b])
     for i in range(len(known)):
         dx, dy, dz = known[i, 0] - pose[9], known[i, 1] - pose[10], known[i, 2] - pose[11]
         x = pose[0] * dx + pose[1] * dy + pose[2] * dz
@@ -239,10 +242,10 @@ def recall_cells(
             if -0.5 <= u < width - 0.5 and -0.5 <= v < height - 0.5:
                 row, column = int(v + 0.5), int(u + 0.5)
                 is_dropped = depth[row, column] > (z + slack if own[row, column] else z - slack)
-        for b in range(len(bodies.core)):
-            cx, cy, cz = _center(bodies.poses[b], bodies.sphere[b])
-            if (x - cx) ** 2 + (y - cy) ** 2 + (z - cz) ** 2 <= bodies.sphere[b, 3] ** 2:
-                is_dropped = is_dropped or _distance(bodies, planes, b, x, y, z) <= 0.0
+        for b in range(len(centers)):
+            away = (x - centers[b, 0]) ** 2 + (y - centers[b, 1]) ** 2 + (z - centers[b, 2]) ** 2
+            if away <= bodies.sphere[b, 3] ** 2 and not is_dropped:
+                is_dropped = _distance(bodies, planes, b, x, y, z) <= 0.0
         if is_dropped:
             continue
         ix, iy = int(np.floor(known[i, 0] / resolution)), int(np.floor(known[i, 1] / resolution))

@@ -175,7 +175,7 @@ class Arbiter:
         if rows.dynamics is not None:
             backup.brake_with(self._settings.bounds.acceleration)
         try:
-            v = backup.check(q, solution.v, t, rows.previous.v, rows.previous.dv, rows.proximity())
+            v = backup.check(q, solution.v, t, rows.previous.v, rows.previous.dv, rows.proximity)
         except NumericalError as error:  # of a predicted state; raised by `step` once it is the present one
             why = f"prediction of an {error}"
             return solution.with_reasons(Reason.of(ReasonKind.NO_BACKUP, severity=Severity.WARNING, detail=why))
