@@ -36,4 +36,4 @@ def test_examples_have_a_number_each():
 
 def test_examples_say_what_they_are_about():
     """In one line, as the first thing."""
-    assert all(re.match(r'"""[A-Z].+', example.read_text(encoding="utf-8")) for example in EXAMPLES)
+    assert all(re.match(r'"""\w.+', example.read_text(encoding="utf-8")) for example in EXAMPLES)

@@ -66,6 +66,8 @@ class DynamicsArrays(NamedTuple):
     """(1,) whether v_tracking is approached at `tracking_factor`, or taken as it is."""
     has_torques: bool
     """Whether torques have limits."""
+    mirrors: bool
+    """Whether the lower triangle of M is that of the upper one; else rows of M are as they are."""
     has_holding: bool
     """Whether there are rows of holding."""
     braking_fraction: float
@@ -101,9 +103,10 @@ def dynamics_step(
         if meeting > 0:
             return TO_MEASURE
     s, n, m = x.summary[0], len(x.v_prev), len(y.rhs) - len(x.rhs)
-    for i in range(n):
-        for j in range(i):
-            y.M[i, j] = y.M[j, i]
+    if y.mirrors:
+        for i in range(n):
+            for j in range(i):
+                y.M[i, j] = y.M[j, i]
     scale_braking(x, y)
     margin, bent = velocity_bounds(x, q), 0.0
     admit_stop(x, y)

@@ -105,7 +105,8 @@ class Arbiter:
         try:
             if from_tasks and problem.jerk_limited and problem.cascade is None:
                 problem = self._rows.within_jerks(problem)
-            solution = self.solver.solve(problem)
+            dynamics = self._rows.dynamics
+            solution = self.solver.solve(problem) if dynamics is None else dynamics.solve(self.solver, problem)
             v = solution.v
             usable = (
                 v.dtype == np.float64
