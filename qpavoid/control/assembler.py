@@ -115,6 +115,8 @@ class RowAssembler(TrackedVelocities):
         looks_ahead = looks_ahead and law.bounded and self._contacts is None and not self._layout.jerk_limited
         numbers: dict[str, Any] = {"looks_ahead": looks_ahead, "regularization": law.compiled_regularization}
         if self.dynamics is not None:
+            if not self.dynamics.has_torques:  # without torque limits, margins are relaxed before accelerations
+                numbers["regularization"] = 0.0
             self.dynamics.approaches[0] = self._approaches = law.bounded
         if numbers != {name: getattr(self._layout, name) for name in numbers}:
             self._forms = [self._make_form(form.layout._replace(**numbers)) for form in self._forms]

@@ -75,7 +75,7 @@ class RobotDynamics:
         self._h, self._gravity = np.zeros(n), np.zeros(n)
         self.approaches: Mask = np.ones(1, dtype=bool)
         """(1,) whether the tracked velocity is approached at the tracking rate, or taken as it is."""
-        self._has_torques, self._acceleration = bool(np.isfinite(self.limit).all()), bounds.acceleration
+        self.has_torques, self._acceleration = bool(np.isfinite(self.limit).all()), bounds.acceleration
         names, units = tuple(robot.coordinate_names), tuple(robot.coordinate_units)
         self.observer = (
             None if settings.observer is None else MomentumObserver(self._model, settings.observer, names, units)
@@ -104,7 +104,7 @@ class RobotDynamics:
         """Return the largest accelerations (nv,) on which braking counts: the limits, else what torques give at q."""
         self.update(q, np.zeros(self._model.nv))
         references: Array = self._acceleration.copy()
-        if self._has_torques:
+        if self.has_torques:
             M = np.abs(np.triu(self._M) + np.triu(self._M, 1).T)[self.actuated]
             left = self._settings.braking_fraction * self.limit - np.abs(self._h[self.actuated])
             own, given = np.maximum(left, _LEAST_LEFT * self.limit) / M.sum(axis=1), references[self.actuated]
@@ -114,17 +114,17 @@ class RobotDynamics:
     def lay_out(self, x: RowLayout) -> None:
         """Lay the rows out, for the memory of a control step."""
         n, a, settings = len(self._h), len(self.actuated), self._settings
-        has_holding = self._has_torques and settings.holding_fraction is not None
-        self._torque_rows = 2 * a if self._has_torques else 0
+        has_holding = self.has_torques and settings.holding_fraction is not None
+        self._torque_rows = 2 * a if self.has_torques else 0
         count = self._torque_rows + (2 * a if has_holding else 0)
         arrays = kernels.DynamicsArrays(
             M=self._M, h=self._h, gravity=self._gravity, gravity_slope=self._gravity_slope,
             actuated=self.actuated, limit=self.limit, acceleration=self.bounds.acceleration.copy(),
-            acceleration_step=np.full(n, np.inf) if self._has_torques else self._acceleration * self._dt,
+            acceleration_step=self.bounds.acceleration * self._dt,
             braking=self.bounds.acceleration,
             rows=np.zeros((count + len(x.rhs), n)), rhs=np.zeros(count + len(x.rhs)),
             torque=np.zeros(a), change=np.zeros(n), factor=np.zeros((n, n)), approaches=self.approaches,
-            has_torques=self._has_torques, mirrors=self._mirrors, has_holding=has_holding,
+            has_torques=self.has_torques, mirrors=self._mirrors, has_holding=has_holding,
             braking_fraction=settings.braking_fraction, holding_fraction=settings.holding_fraction or 0.0,
             tracking_factor=min(1.0, settings.tracking_rate * self._dt),
             row_factor=min(1.0, settings.row_rate * self._dt),
@@ -135,6 +135,7 @@ class RobotDynamics:
         self._inverse = kernels.direct(kernels.inverse_dynamics, self.packed, zero, zero, self._dt)
         if a == n:
             kernels.forward_dynamics(self.packed)
+        kernels.project_widened(np.eye(n), 1.0, zero, np.zeros((0, n)), zero[:0], *[zero - 1.0, zero + 1.0] * 2)
         kernels.slow_rows(kernels.pack(x), self.packed, 0)
 
     def step(self, packed: Any, *arguments: Any) -> Callable[..., int]:

@@ -26,7 +26,14 @@ from qpavoid.kernels.contact_forces import (
     standing_dynamics,
 )
 from qpavoid.kernels.depth import CellGrid, OwnBodies, fill_cells, mark_own_pixels, recall_cells
-from qpavoid.kernels.dynamics import DynamicsArrays, dynamics_step, forward_dynamics, inverse_dynamics, slow_rows
+from qpavoid.kernels.dynamics import (
+    DynamicsArrays,
+    dynamics_step,
+    forward_dynamics,
+    inverse_dynamics,
+    project_widened,
+    slow_rows,
+)
 from qpavoid.kernels.estimates import ObstacleArrays, are_fine, check_updates, observe
 from qpavoid.kernels.kinematics import KinematicsArrays, update_kinematics
 from qpavoid.kernels.layout import SUMMARY, RowLayout
@@ -130,6 +137,7 @@ __all__ = [
     "prediction_error_bound",
     "project",
     "project_soft",
+    "project_widened",
     "projection_cost",
     "recall_cells",
     "roll_out_stop",
