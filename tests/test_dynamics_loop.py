@@ -76,13 +76,6 @@ def test_dive_at_a_table_brakes_in_time(fraction):
 
 
 @pytest.mark.slow
-def test_dive_ends_at_the_table_without_rows_of_holding():
-    """What those rows are for: the weaker robot gets where gravity takes all of its torques, and falls."""
-    fields = ["dynamics.torque_limits=0.7", "dynamics.holding_fraction=null"]
-    assert play("panda_dive", fields, mass_scale=1.2)[1] < 0.0
-
-
-@pytest.mark.slow
 def test_panda_with_jerk_limits_avoids_the_ball():
     log, closest, figures = play("panda_torque", ["limits.jerk=3000"])
     assert closest >= D1 - 0.5e-3
