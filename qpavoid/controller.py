@@ -17,7 +17,7 @@ from qpavoid.config import Avoidance, Dynamics, Limits, Planning, Progress, Scen
 from qpavoid.config.scenario import MAX_LATENCY
 from qpavoid.control.arguments import Obstacles
 from qpavoid.control.builder import ProblemBuilder, StepProblem
-from qpavoid.control.contacts import ContactRows
+from qpavoid.control.contacts import ContactRows, within_contacts
 from qpavoid.control.dynamics import make_dynamics
 from qpavoid.control.inputs import LARGEST_VELOCITY, check_velocity
 from qpavoid.control.scenario import build_parts
@@ -31,17 +31,12 @@ from qpavoid.model.robot import Robot
 from qpavoid.model.scene import Obstacle, Scene
 from qpavoid.planning.replanning import Replanning
 from qpavoid.problem import Array, Solution, State, as_vector, require_finite
-from qpavoid.reason import Reason, ReasonKind
 from qpavoid.safety.arbiter import Arbiter
 from qpavoid.solvers import Solver, check_solver, make_solver
 from qpavoid.solvers.solver import NamedSolver
 
 _MAX_DT = 1.0
 """Largest control period that is accepted [s]: a longer one is in milliseconds."""
-_NO_BACKUP_WITH_CONTACTS = Reason.of(
-    ReasonKind.NO_BACKUP, "contacts", detail="backup trajectories do not hold contacts: avoidance.backup"
-)
-"""Assumption where obstacles move and the robot stands on something."""
 _WARM_UP = "a passing obstacle, to warm up"
 
 
@@ -104,11 +99,8 @@ class Controller(SceneChanges, SplitStep):
         """Frames with a position to follow, then with an orientation alone, then all other tasks."""
         law, self.has_contacts = make_solver(solver) if isinstance(solver, str) else solver, contacts is not None
         check_solver(law, self.has_contacts)
-        self.avoidance, self.limits = avoidance or Avoidance(), limits or Limits()
-        self._v_shape, self._no_backup = (scene.robot.model.nv,), tuple[Reason, ...]()
-        if contacts is not None and self.avoidance.backup:
-            self.avoidance = self.avoidance.model_copy(update={"backup": False})
-            self._no_backup = (_NO_BACKUP_WITH_CONTACTS,)
+        self.limits, self._v_shape = limits or Limits(), (scene.robot.model.nv,)
+        self.avoidance, self._no_backup = within_contacts(avoidance or Avoidance(), self.has_contacts, bool(dynamics))
         torques, bounds = make_dynamics(
             dynamics, scene.robot, self.limits, self.avoidance, dt,
             contacts=contacts, latency=latency, planning=planning,

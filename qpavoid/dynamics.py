@@ -34,7 +34,9 @@ class StepDynamics(NamedTuple):
     b: Array
     """(m,) their right-hand sides [rad/s or m/s; 1/s]."""
     torque_rows: int
-    """How many of the rows are those of torques."""
+    """How many of the rows are those of torques, and of friction cones after them."""
+    points: tuple[str, ...] = ()
+    """Frame of each contact point, of the six rows of its cone."""
 
     def torque(self, v: Array) -> Array:
         """Return the torques (a,) that lead to v (nv,) at the end of the period [Nm or N]."""

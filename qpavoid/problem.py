@@ -107,14 +107,8 @@ class Contacts(NamedTuple):
     """(c,) velocity of these frames that corrects their sliding [m/s, rad/s]."""
 
     def project(self, v: Array) -> Array:
-        """Return the velocity (nv,) closest to v with J v = b.
-
-        That is v itself where it meets the rows to `CONTACT_TOLERANCE`.
-
-        Args:
-            v: velocity (nv,) [rad/s or m/s].
-        """
-        if np.abs(self.J @ v - self.b).max() <= CONTACT_TOLERANCE:
+        """Return the velocity (nv,) closest to v with J v = b: v itself if it meets that to `CONTACT_TOLERANCE`."""
+        if np.abs(self.J @ v - self.b).max(initial=0.0) <= CONTACT_TOLERANCE:
             return v
         return np.asarray(self.v_particular + self.Z @ (self.Z.T @ v))
 
@@ -261,6 +255,10 @@ class Solution(NamedTuple):
     """Largest change of the solver's raw velocity by the limits [rad/s or m/s]; 0 of a `bounded` solver."""
     plan: str = ""
     """Plan that is followed in place of the tasks alone, and why, in a sentence; empty without one."""
+    forces: dict[str, Array] | None = None
+    """Force (k, 3) of the ground on each corner of a contact, by its frame, world [N]; None without such."""
+    external: Array | None = None
+    """(nv,) torque from outside, of a momentum observer [Nm or N]; None without one."""
     torque: Array | None = None
     """(n_actuated,) torques that lead to `v` [Nm or N], within their limits; None at velocity level."""
     acceleration: Array | None = None

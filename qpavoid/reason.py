@@ -43,8 +43,13 @@ class ReasonKind(str, Enum):
     """The same of its upper position limit."""
     AT_VELOCITY_LIMIT = "AT_VELOCITY_LIMIT"
     """A joint moves at its velocity limit where a row demands more: the joint, its velocity [rad/s or m/s]."""
+    TOUCHED = "TOUCHED"
+    """A torque from outside is beyond its threshold: the joint, that torque [Nm or N]; an alarm where it stops the
+    robot."""
     AT_TORQUE_LIMIT = "AT_TORQUE_LIMIT"
     """A joint is at its torque limit where a row demands more: the joint, its torque [Nm or N]."""
+    AT_FRICTION_LIMIT = "AT_FRICTION_LIMIT"
+    """A force of a contact is at the edge of its friction cone, or at its least or greatest: the frame."""
     TORQUE_SATURATED = "TORQUE_SATURATED"
     """The torque of a velocity was cut at its limit, and another velocity follows from it: the joint, the excess
     [Nm or N]."""
@@ -134,7 +139,9 @@ _TEXTS: dict[str, str] = {
     "AT_LOWER_LIMIT": "at its lower limit, velocity bound",
     "AT_UPPER_LIMIT": "at its upper limit, velocity bound",
     "AT_VELOCITY_LIMIT": "at its velocity limit,",
+    "TOUCHED": "is touched by",
     "AT_TORQUE_LIMIT": "at its torque limit,",
+    "AT_FRICTION_LIMIT": "a force of the contact is at the limit of its cone",
     "TORQUE_SATURATED": "torque limit cuts",
     "HOLDING_RELAXED": "gravity takes too much of its torque, row relaxed by",
     "STALLED": "no progress",

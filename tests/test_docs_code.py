@@ -85,7 +85,7 @@ def test_loop_of_ones_own_ends_without_the_cup():
 
 
 def test_own_scenario_of_the_start_is_as_the_page_says(cli, tmp_path):
-    """The QP arrives where tracking collides; with the ball on the path it stops in front of it, and says why."""
+    """The QP arrives where tracking collides; with the ball on the goal it stops in front of it, and says why."""
     (block,) = blocks("start.md", "yaml")
     (tmp_path / "first.yaml").write_text(block)
     _, blocked = re.findall(r"^    (qpavoid .*first.yaml.*)$", PAGES["start.md"], re.M)

@@ -196,7 +196,7 @@ def test_settings_that_cannot_be_meant_are_refused(robot):
     with pytest.raises(UnknownName, match="armature: no joint"):
         make(robot, dynamics=Dynamics(armature={"panda_joint11": 0.1}))
     g1 = Robot.load("g1")
-    with pytest.raises(ConfigError, match="a fixed base is needed"):
+    with pytest.raises(ConfigError, match="floats stands on `contacts`"):
         Controller(build_scene(g1), [], dynamics=Dynamics())
     bare = dataclasses.replace(robot, model=robot.model.copy())
     bare.model.effortLimit = np.append(np.zeros(1), LIMITS[1:])

@@ -17,6 +17,7 @@ from qpavoid.config.control import (
     TaskSwitching,
 )
 from qpavoid.config.motion import Circle, Csv, Fixed, Line, Motion, Waypoints
+from qpavoid.config.observer import Observer
 from qpavoid.config.plant import Payload, PlantSettings, Push
 from qpavoid.config.robot import Body, Hull, JointLimits, PairMargin, Polytope, RobotConfig
 from qpavoid.config.scenario import ObstacleConfig, ScenarioConfig
@@ -62,8 +63,8 @@ __all__ = [
     "AlignTask", "AnyTask", "Avoidance", "Beta", "Block", "Body", "Box", "Capsule", "Circle", "ComTask", "Cone",
     "Contact", "Csv", "Cylinder", "DampingTask", "Dynamics", "Ellipsoid", "Eq10Solver", "FastFinish", "Fixed",
     "GradientProjectionSolver", "HalfSpace", "HqpSolver", "Hull", "JointLimits", "Limits", "Line", "LookAtTask",
-    "ManipulabilityTask", "Mesh", "Motion", "ObstacleConfig", "ObstacleShape", "PairMargin", "Payload", "Planning",
-    "PlantSettings", "PointCloud", "Polytope", "PostureTask", "PotentialFieldSolver", "Progress", "Push", "QpSolver",
-    "RelativeTask", "RobotConfig", "ScenarioConfig", "Sensing", "Shape", "SolverConfig", "Sphere", "StepSearchSolver",
-    "Task", "TaskBlock", "TaskSwitching", "TrackingSolver", "Waypoints", "expand_solver",
+    "ManipulabilityTask", "Mesh", "Motion", "Observer", "ObstacleConfig", "ObstacleShape", "PairMargin", "Payload",
+    "Planning", "PlantSettings", "PointCloud", "Polytope", "PostureTask", "PotentialFieldSolver", "Progress", "Push",
+    "QpSolver", "RelativeTask", "RobotConfig", "ScenarioConfig", "Sensing", "Shape", "SolverConfig", "Sphere",
+    "StepSearchSolver", "Task", "TaskBlock", "TaskSwitching", "TrackingSolver", "Waypoints", "expand_solver",
 ]  # fmt: skip

@@ -7,6 +7,7 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, model_validator
 
 from qpavoid.config.base import Block, NonNegative, Positive
+from qpavoid.config.observer import Observer
 
 Fraction = Annotated[float, Field(gt=0, le=1)]
 
@@ -109,6 +110,8 @@ class Dynamics(Block):
     then has the stiffness K k_v and the damping k_v."""
     row_rate: Positive = 100.0
     """α2 [1/s]: the rate at which rows are approached, at least four times the gain of the avoidance rows."""
+    observer: Observer | None = None
+    """What touches the robot, see `Solution.external`; left out, or `null`: it is not observed."""
     armature: NonNegative | dict[str, NonNegative] = {}
     """Inertia of rotor and gear, of all joints or by joint name [kg m² or kg]; what is left out is that of the robot's
     file."""

@@ -63,13 +63,16 @@ class RowAssembler(TrackedVelocities):
         is_hard = limits.relax_acceleration or settings.dynamics is not None
         self._hard = (x.hard_lower, x.hard_upper) if is_hard else (x.lower, x.upper)
         self._packed: Any = kernels.pack(x)
-        self._contacts, self.dynamics = contacts, settings.dynamics
+        self.dynamics = settings.dynamics
+        own = None if self.dynamics is None else self.dynamics.contacts
+        self.contacts = self._contacts = own or (None if contacts is None else contacts.own_copy())
+        """Frames that rest, and which of them do now; None without any."""
         if self.dynamics is not None:
             self.dynamics.lay_out(x)
         self._scene = scene
         self.joint_names, self.joint_units = tuple(scene.robot.coordinate_names), tuple(scene.robot.coordinate_units)
         """Name and unit of each coordinate."""
-        self.previous = PreviousVelocity(x, contacts is not None)
+        self.previous = PreviousVelocity(x, contacts is not None and self.dynamics is None)
         """Velocity at which the robot moves when a step begins."""
         self._stops = JerkStops(x, self._packed) if x.jerk_limited else None
         self.targets = x.targets
@@ -112,6 +115,8 @@ class RowAssembler(TrackedVelocities):
         looks_ahead = looks_ahead and law.bounded and self._contacts is None and not self._layout.jerk_limited
         numbers: dict[str, Any] = {"looks_ahead": looks_ahead, "regularization": law.compiled_regularization}
         if self.dynamics is not None:
+            if not self.dynamics.has_torques:  # without torque limits, margins are relaxed before accelerations
+                numbers["regularization"] = 0.0
             self.dynamics.approaches[0] = self._approaches = law.bounded
         if numbers != {name: getattr(self._layout, name) for name in numbers}:
             self._forms = [self._make_form(form.layout._replace(**numbers)) for form in self._forms]
@@ -176,8 +181,12 @@ class RowAssembler(TrackedVelocities):
         if from_tasks and self.task_errors.size:
             self._task_rows.write(q, self._forward, targets[len(self.targets) :])
         if self._contacts is not None:
-            self._contact_rows = resting = self._contacts.update(self._forward)
-            x.v_prev[:] = resting.project(x.v_prev)
+            self._contacts.advance(x.dt, self._forward)
+            if self.dynamics is not None:  # from the velocity as measured
+                self._contact_rows = self.dynamics.stand(self._forward, x.v_prev)
+            else:
+                self._contact_rows = resting = self._contacts.update(self._forward)
+                x.v_prev[:] = resting.project(x.v_prev)
         return self._finish()
 
     def follow(self, v_desired: Array, at_once: bool = False) -> bool:
@@ -236,10 +245,15 @@ class RowAssembler(TrackedVelocities):
             summary.bent = self._track_within(contacts)
         else:
             x.v_tracking[:] = contacts.project(x.v_tracking)
-        self.previous.tighten_bounds()
+        if self.dynamics is None:
+            self.previous.tighten_bounds()
+        elif self.dynamics.approaches[0]:
+            x.v_tracking[:] = self.dynamics.approach(x.v_tracking, x.v_prev)
         if x.task_switching:
             summary.bent = 0.0
             kernels.row_bounds(self._packed, summary.rows, self.query.is_moving)
+            if self.dynamics is not None:
+                kernels.slow_rows(self._packed, self.dynamics.packed, summary.rows)
         summary.violation = kernels.tracking_violation(self._packed, summary.rows)
 
     def _track_within(self, contacts: Contacts) -> float:

@@ -109,6 +109,9 @@ class ProblemBuilder:
             observed = self.tracker.advance(update)
             query.place(self.tracker.current)
             faults, assumptions = faults + observed.stop, assumptions + observed.assumptions
+        if rows.dynamics is not None and v is not None:
+            rows.dynamics.observe(q, v)
+            faults, assumptions = rows.dynamics.touched(faults, assumptions)
         is_settled = rows.compute(q, targets, v_desired)
         if self.attachments.is_watching:
             self.attachments.update()
@@ -187,6 +190,8 @@ class ProblemBuilder:
     def reset(self, v: Array) -> None:
         """Forget the steps before; the robot moves at v (nv,). Attached objects stay attached."""
         self._restart(v)
+        if (dynamics := self.rows.dynamics) is not None and dynamics.observer is not None:
+            dynamics.observer.reset()
         self.begun, self._thread = None, None
         self._clock.reset()
         self._targets.last = ()

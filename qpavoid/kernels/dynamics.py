@@ -16,7 +16,7 @@ from qpavoid.kernels.braking_trajectory import stop_velocity
 from qpavoid.kernels.cholesky import factorise, solve_factored
 from qpavoid.kernels.clearance import is_clear
 from qpavoid.kernels.packing import compiled
-from qpavoid.kernels.qp import project
+from qpavoid.kernels.qp import project, project_soft
 from qpavoid.kernels.rows import distance_rows, row_bounds
 from qpavoid.kernels.step import SETTLED, TO_MEASURE, UNSETTLED, _is_too_near, find_near_pairs, violation
 from qpavoid.kernels.tasks import frame_rows
@@ -27,6 +27,8 @@ LEAST_SCALE = 0.02
 """Least scale of the accelerations on which braking counts [-]: bounds need some."""
 HOLDING_GAIN = 5.0
 """ξ_g: share per time of what gravity may still take of a torque that it takes at the most [1/s]."""
+BOUND_SOFTNESS = 1e-6
+"""Softness of bounds that rows may pass [(m/s)² per unit of the cost]: so little that nothing else is worth it."""
 ROW_TOLERANCE = 1e-6
 """By how much torque rows are narrower than the limits [rad/s or m/s]: what a back end may violate them by."""
 
@@ -49,7 +51,7 @@ class DynamicsArrays(NamedTuple):
     acceleration: Array
     """(n,) largest acceleration on which braking may count [rad/s² or m/s²]."""
     acceleration_step: Array
-    """(n,) largest change of v in a step that the acceleration limits allow, infinite without any [rad/s or m/s]."""
+    """(n,) largest change of v in a step that rows do not need, infinite without any [rad/s or m/s]."""
     braking: Array
     """(n,) out: acceleration on which braking counts here [rad/s² or m/s²]."""
     rows: Array
@@ -66,6 +68,8 @@ class DynamicsArrays(NamedTuple):
     """(1,) whether v_tracking is approached at `tracking_factor`, or taken as it is."""
     has_torques: bool
     """Whether torques have limits."""
+    mirrors: bool
+    """Whether the lower triangle of M is that of the upper one; else rows of M are as they are."""
     has_holding: bool
     """Whether there are rows of holding."""
     braking_fraction: float
@@ -101,9 +105,10 @@ def dynamics_step(
         if meeting > 0:
             return TO_MEASURE
     s, n, m = x.summary[0], len(x.v_prev), len(y.rhs) - len(x.rhs)
-    for i in range(n):
-        for j in range(i):
-            y.M[i, j] = y.M[j, i]
+    if y.mirrors:
+        for i in range(n):
+            for j in range(i):
+                y.M[i, j] = y.M[j, i]
     scale_braking(x, y)
     margin, bent = velocity_bounds(x, q), 0.0
     admit_stop(x, y)
@@ -113,7 +118,11 @@ def dynamics_step(
         if x.task_switching:
             bent = 0.0
     k = distance_rows(x, x.distances.rows[: x.distances.counts[1]], influence_distance, moving)
+    stop = x.v_stop.copy()
+    if y.has_torques:  # rows ask for more than the straight stop gives, where they have to
+        x.v_stop[:] = 0.0
     row_bounds(x, k, moving)
+    x.v_stop[:] = stop
     slow_rows(x, y, k)
     if y.approaches[0]:
         for j in range(n):
@@ -134,10 +143,46 @@ def dynamics_step(
         return SETTLED if is_tracking_clear else UNSETTLED
     if _is_too_near(x, k):
         return UNSETTLED
-    A = x.A if from_tasks else x.identity
-    v, is_solved = project(A, max(x.regularization, bent), x.v_tracking, G, g, x.lower, x.upper)
+    A, regularization = x.A if from_tasks else x.identity, max(x.regularization, bent)
+    v, is_solved = project(A, regularization, x.v_tracking, G, g, x.lower, x.upper)
+    if not is_solved:
+        v, is_solved = project_widened(
+            A, regularization, x.v_tracking, G, g, x.lower, x.upper, x.hard_lower, x.hard_upper
+        )
     x.v[:] = v
     return SETTLED if is_solved and is_clear(x, q, v, k, influence_distance) else UNSETTLED
+
+
+@compiled
+def project_widened(
+    A: Array, regularization: float, v_tracking: Array, J: Array, b: Array, lower: Array, upper: Array,
+    hard_lower: Array, hard_upper: Array,
+) -> tuple[Array, bool]:  # fmt: skip
+    """Compute `project` with bounds that are passed as little as rows need, within the hard ones.
+
+    Rows come before accelerations here: where a model is wrong, it takes more of them to brake.
+
+    Args:
+        A: tracking rows (r, n).
+        regularization: λ.
+        v_tracking: velocity of least cost (n,) [rad/s or m/s].
+        J: rows (k, n).
+        b: their right-hand sides (k,).
+        lower: lower bounds (n,) [rad/s or m/s].
+        upper: upper bounds (n,) [rad/s or m/s].
+        hard_lower: those that are never passed (n,) [rad/s or m/s].
+        hard_upper: the same above (n,).
+
+    Returns:
+        See `project_soft`.
+    """
+    k, n = J.shape
+    G, g, soft = np.zeros((k + 2 * n, n)), np.empty(k + 2 * n), np.zeros(k + 2 * n)
+    G[:k], g[:k], soft[k:] = J, b, BOUND_SOFTNESS
+    for j in range(n):
+        G[k + j, j], g[k + j] = 1.0, lower[j]
+        G[k + n + j, j], g[k + n + j] = -1.0, -upper[j]
+    return project_soft(A, regularization, v_tracking, G, g, hard_lower, hard_upper, soft)
 
 
 @compiled
@@ -191,17 +236,18 @@ def stopping_factor(x: Any, y: Any) -> float:
 def admit_stop(x: Any, y: Any) -> None:
     """Let the hard bounds of a step admit the straight stop, (1 - σ) times the measured velocity, and write v_stop.
 
-    So that there is always something between them and the torque limits; the bounds that a law keeps to where it can
-    are as tight as ever. Those that ask a coordinate to return from outside its position limits are approached at the
-    rate of rows, and no slower than it can brake. The step itself is not bounded by the accelerations on which braking
-    counts, but by the torques; by acceleration limits where torques have none. With jerk limits, bounds and stop are
-    those of the velocity level.
+    So there is always something between them and the torque limits. lower and upper, which a law keeps to where rows
+    let it, are as tight as ever, and contain the accelerations. Those that ask a coordinate to return from outside its
+    position limits are approached at the rate of rows, and no slower than it can brake.
+
+    The stop takes away what braking counts on or, where that is more, what the rate of rows does, as far as torques
+    let it. With jerk limits, bounds and stop are those of the velocity level.
 
     Args:
         x: reads v_prev and v_step; writes hard_lower, hard_upper, lower, upper and v_stop (n,) [rad/s or m/s].
         y: reads M, h, limit, acceleration_step.
     """
-    v, factor, stop = x.v_prev, stopping_factor(x, y), 1.0
+    v, factor, steps = x.v_prev, stopping_factor(x, y), 1.0
     for j in range(len(v)):
         low, high, step = x.hard_lower[j], x.hard_upper[j], x.v_step[j]
         if low > 0.0:
@@ -215,11 +261,14 @@ def admit_stop(x: Any, y: Any) -> None:
             x.lower[j], x.upper[j] = min(max(v[j] - change, low), high), max(min(v[j] + change, high), low)
         if y.has_torques:
             x.hard_lower[j], x.hard_upper[j] = min(low, (1.0 - factor) * v[j]), max(high, (1.0 - factor) * v[j])
-        stop = max(stop, abs(v[j]) / y.acceleration_step[j])
+        steps = max(steps, abs(v[j]) / step)
     if x.jerk_limited:
         stop_velocity(x)
         return
-    factor = min(factor, 1.0 / stop) if x.acceleration_limited else 1.0
+    if y.has_torques:
+        factor = min(factor, max(1.0 / steps, y.row_factor))
+    else:
+        factor = 1.0 / steps if x.acceleration_limited else 1.0
     for j in range(len(v)):
         x.v_stop[j] = (1.0 - factor) * v[j]
         if not y.has_torques:

@@ -69,7 +69,7 @@ def run(
     _check_start(controller, q, scenario)
     dt, ticks = scenario.dt, round(scenario.duration / scenario.dt) + 1
     follower = Follower(controller.scene.robot.model, q, scenario.latency, dt)
-    motors = None if plant is None else _make_plant(controller, q, plant)
+    motors = None if plant is None else _make_plant(controller, q, plant, scenario)
     try:
         recorder = Recorder(controller, scenario, ticks, motors)
     except MemoryError:
@@ -94,12 +94,13 @@ def run(
     return recorder.log(stopped_by)
 
 
-def _make_plant(controller: Controller, q: Array, settings: PlantSettings) -> TorquePlant:
-    """Make a plant, at q (nq,); MuJoCo is loaded for it alone."""
+def _make_plant(controller: Controller, q: Array, settings: PlantSettings, scenario: ScenarioConfig) -> TorquePlant:
+    """Make a plant, at q (nq,), on the corners of its contacts; MuJoCo is loaded for it alone."""
     from qpavoid.run.torque_plant import TorquePlant
 
+    points = [(contact.frame, np.array(contact.vertices or [(0.0, 0.0, 0.0)])) for contact in scenario.contacts]
     try:
-        return TorquePlant(controller.scene.robot, q, settings)
+        return TorquePlant(controller.scene.robot, q, settings, points)
     except ValueError as error:
         raise ConfigError(f"plant: {error}") from None
 

@@ -105,7 +105,8 @@ class Arbiter:
         try:
             if from_tasks and problem.jerk_limited and problem.cascade is None:
                 problem = self._rows.within_jerks(problem)
-            solution = self.solver.solve(problem)
+            dynamics = self._rows.dynamics
+            solution = self.solver.solve(problem) if dynamics is None else dynamics.solve(self.solver, problem)
             v = solution.v
             usable = (
                 v.dtype == np.float64
@@ -158,6 +159,8 @@ class Arbiter:
         if result is None:
             return solution
         v, scale, violation, pair, distance = result
+        if _limits_torques(problem) and distance >= 0.0:
+            return solution
         if violation <= TOLERANCE:
             return solution._replace(v=v, command_scale=scale * solution.command_scale)
         names = self._settings.scene.pair_names[pair]
@@ -205,9 +208,13 @@ class Arbiter:
         return solution.with_reasons(*excesses) if excesses else solution
 
 
+def _limits_torques(problem: Problem) -> bool:
+    return problem.dynamics is not None and problem.dynamics.torque_rows > 0
+
+
 def _clipped(problem: Problem, solution: Solution) -> Solution:
     """Clip the velocity of a `bounded` solver to the bounds that it has to keep, in case it does not."""
-    is_solved, v = solution.status is Status.SOLVED, solution.v
+    is_solved, v = solution.status is Status.SOLVED and not _limits_torques(problem), solution.v
     lower, upper = (problem.lower, problem.upper) if is_solved else (problem.hard_lower, problem.hard_upper)
     within = np.minimum(np.maximum(v, lower), upper)
     if within.tobytes() == v.tobytes():

@@ -53,7 +53,7 @@ class Hqp(Qp):
         if velocities is None:
             velocities = cascade(problem, least_squares) if problem.levels else problem.v_tracking[None]
         unconstrained = velocities[-1].copy()
-        (J, b), lower, upper = problem.inequalities, problem.lower, problem.upper
+        (J, b), (lower, upper) = problem.inequalities, self._bounds(problem)
         if kernels.violation(unconstrained, J, b, lower, upper) <= 0.0:
             return Solution(unconstrained)
         if not np.isfinite(velocities).all():

@@ -46,9 +46,10 @@ def relax(problem: Problem, regularization: float) -> Array | None:
     rows, bounds, dynamics = problem.avoidance, (problem.lower, problem.upper), problem.dynamics
     if dynamics is not None:  # torques first, then contact, then holding, then margins
         problem = problem._replace(dynamics=dynamics.with_holding(dynamics.b[:0]))
+        bounds = (problem.hard_lower, problem.hard_upper) if dynamics.torque_rows else bounds
     closest, no_floor = partial(_closest, problem, regularization), np.full(len(rows.d), -np.inf)
     b_contact = rows.b_contact - TOLERANCE
-    if problem.hard_lower is not problem.lower and closest(rows.J, b_contact, *bounds) is None:
+    if bounds[0] is not problem.hard_lower and closest(rows.J, b_contact, *bounds) is None:
         hard = problem.hard_lower, problem.hard_upper
         b_contact = b_contact - _lexicographic_slack(rows, b_contact, no_floor, hard, closest)[0]
         bounds = _widened_bounds(problem, b_contact, closest)
