@@ -70,7 +70,7 @@ class ReasonKind(str, Enum):
     PLAN = "PLAN"
     """Of logs: a plan is followed in place of the tasks alone; `detail` says since when, and why."""
     NO_PLAN = "NO_PLAN"
-    """Nothing is forecast or planned, or not all that is configured: what excludes it."""
+    """Nothing is forecast or planned, or not all that is wanted: what excludes it; `detail` says why."""
     BUDGET_SPENT = "BUDGET_SPENT"
     """The robot brakes, or follows its backup trajectory, as the budget of the control step was spent: before what."""
     STALE = "STALE"
@@ -95,8 +95,6 @@ class ReasonKind(str, Enum):
     """No velocity within the joint limits meets the contacts: `contacts`."""
     PRIORITY_UNSOLVED = "PRIORITY_UNSOLVED"
     """No back end could solve the QP of a priority level: the level."""
-    NOT_PLANNED = "NOT_PLANNED"
-    """No path is planned: why, in `detail`."""
     START_TOO_NEAR = "START_TOO_NEAR"
     """A path would begin in contact: the pair, its distance [m]."""
     GOAL_TOO_NEAR = "GOAL_TOO_NEAR"
@@ -165,7 +163,6 @@ _TEXTS: dict[str, str] = {
     "SOLVER_FAILED": "no usable velocity",
     "CONTACTS_INFEASIBLE": "joint limits leave no velocity that holds them",
     "PRIORITY_UNSOLVED": "no back end could solve its QP",
-    "NOT_PLANNED": "no path is planned",
     "START_TOO_NEAR": "a path would begin in contact, distance",
     "GOAL_TOO_NEAR": "no goal of the path is clear",
     "NOT_ATTAINED": "no configuration attains the targets",
