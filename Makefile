@@ -2,16 +2,17 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: run view figures film test campaign smoke lint types clean
+.PHONY: run view figures film test campaign smoke docs lint types clean
 
 run: .venv/run
 	$(BIN)/qpavoid compare situation1 situation2 chasing_sphere five_spheres stall \
 	  --solvers tracking,eq10-literal,eq10,qp --out out
 
 view: .venv/view
-	$(BIN)/qpavoid view panda_ball
+	$(BIN)/qpavoid view panda_drag
 
 figures: run
+	$(BIN)/python docs/figures/draw.py
 	cp out/five_spheres_compare_time.png out/five_spheres_qp_motion.png docs/figures/
 
 film: .venv/dev
@@ -25,6 +26,9 @@ campaign: .venv/dev
 
 smoke: .venv/dev
 	$(BIN)/qpavoid bench smoke
+
+docs: .venv/dev
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
 
 lint: .venv/dev
 	$(BIN)/ruff check .
@@ -46,10 +50,10 @@ types: .venv/dev
 	touch $@
 
 .venv/bin/python:
-	@$(PYTHON) -c 'import sys; v = sys.version_info[:2]; sys.exit(0 if (3, 10) <= v <= (3, 13) else \
-	"qpavoid needs Python 3.10 to 3.13, this is %d.%d: make PYTHON=python3.12 ..." % v)'
+	@$(PYTHON) -c 'import sys; v = sys.version_info[:2]; sys.exit(0 if (3, 10) <= v <= (3, 14) else \
+	"qpavoid needs Python 3.10 to 3.14, this is %d.%d: make PYTHON=python3.12 ..." % v)'
 	$(PYTHON) -m venv .venv
 	$(BIN)/python -m pip install --quiet --upgrade pip
 
 clean:
-	rm -rf .venv out dist
+	rm -rf .venv out dist site

@@ -40,6 +40,7 @@ app = typer.Typer(
     add_completion=False,
     no_args_is_help=True,
     pretty_exceptions_enable=False,
+    rich_markup_mode=None,  # which takes units in brackets for markup
     help="Follow a planned motion and stay clear of obstacles, other arms and yourself.",
 )
 app.add_typer(robot_commands.app, name="robot")

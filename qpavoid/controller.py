@@ -12,16 +12,17 @@ from typing import Any, NoReturn
 import numpy as np
 
 from qpavoid import kernels
-from qpavoid.budget import UNLIMITED, Budget
-from qpavoid.config import Avoidance, Limits, Planning, Progress, ScenarioConfig, Sensing, Sphere
+from qpavoid.budget import Budget
+from qpavoid.config import Avoidance, Dynamics, Limits, Planning, Progress, ScenarioConfig, Sensing, Sphere
 from qpavoid.config.scenario import MAX_LATENCY
 from qpavoid.control.arguments import Obstacles
 from qpavoid.control.builder import ProblemBuilder, StepProblem
-from qpavoid.control.contacts import ContactRows
+from qpavoid.control.contacts import ContactRows, within_contacts
+from qpavoid.control.dynamics import make_dynamics
 from qpavoid.control.inputs import LARGEST_VELOCITY, check_velocity
 from qpavoid.control.scenario import build_parts
 from qpavoid.control.scene_changes import SceneChanges
-from qpavoid.control.settings import ControlSettings
+from qpavoid.control.settings import ControlSettings, make_budget
 from qpavoid.control.split_step import SplitStep
 from qpavoid.control.tasks import RowTask, in_order
 from qpavoid.control.tick import Tick, copied
@@ -30,17 +31,12 @@ from qpavoid.model.robot import Robot
 from qpavoid.model.scene import Obstacle, Scene
 from qpavoid.planning.replanning import Replanning
 from qpavoid.problem import Array, Solution, State, as_vector, require_finite
-from qpavoid.reason import Reason, ReasonKind
 from qpavoid.safety.arbiter import Arbiter
 from qpavoid.solvers import Solver, check_solver, make_solver
 from qpavoid.solvers.solver import NamedSolver
 
 _MAX_DT = 1.0
 """Largest control period that is accepted [s]: a longer one is in milliseconds."""
-_NO_BACKUP_WITH_CONTACTS = Reason.of(
-    ReasonKind.NO_BACKUP, "contacts", detail="backup trajectories do not hold contacts: avoidance.backup"
-)
-"""Assumption where obstacles move and the robot stands on something."""
 _WARM_UP = "a passing obstacle, to warm up"
 
 
@@ -61,6 +57,7 @@ class Controller(SceneChanges, SplitStep):
         latency: float = 0.0,
         planning: Planning | None = None,
         budget: float | Budget | None = None,
+        dynamics: Dynamics | None = None,
     ) -> None:
         """Lay out the memory of a control step.
 
@@ -76,13 +73,14 @@ class Controller(SceneChanges, SplitStep):
             contacts: frames that rest, see `build_contacts`; none if left out.
             latency: time after which the actuators follow a command [s], see `step`.
             planning: forecasts and plans; none if left out.
+            dynamics: torque level; the command is a velocity alone if left out.
             budget: time after which a step leaves out what is left of relaxation, stop look-ahead and backup search
                 [s], and brakes or follows its backup trajectory instead, with a reason of kind BUDGET_SPENT; runs are
                 then not reproducible. As long as it takes if left out.
 
         Raises:
             UnknownName, SolverNotInstalled: of the solver.
-            ConfigError: dt, latency or budget cannot be meant; contacts with a solver that does not hold them.
+            ConfigError: dt, latency, budget or dynamics cannot be meant; a solver that does not hold contacts.
         """
         begin = perf_counter()
         if not 0.0 < dt <= _MAX_DT:
@@ -91,7 +89,7 @@ class Controller(SceneChanges, SplitStep):
             raise ConfigError(f"latency: {latency} s, expected 0 to {MAX_LATENCY}; it is in seconds")
         self._another = partial(
             type(self), tasks=tasks, dt=dt, avoidance=avoidance, limits=limits, sensing=sensing, progress=progress,
-            contacts=contacts, latency=latency, planning=planning, budget=budget,
+            contacts=contacts, latency=latency, planning=planning, budget=budget, dynamics=dynamics,
         )  # fmt: skip
         frames, others = in_order(tasks)
         self.scene = scene = scene.own_copy() if scene.spare else scene
@@ -101,19 +99,15 @@ class Controller(SceneChanges, SplitStep):
         """Frames with a position to follow, then with an orientation alone, then all other tasks."""
         law, self.has_contacts = make_solver(solver) if isinstance(solver, str) else solver, contacts is not None
         check_solver(law, self.has_contacts)
-        self.avoidance, self.limits = avoidance or Avoidance(), limits or Limits()
-        self._v_shape, self._no_backup = (scene.robot.model.nv,), tuple[Reason, ...]()
-        if contacts is not None and self.avoidance.backup:
-            self.avoidance = self.avoidance.model_copy(update={"backup": False})
-            self._no_backup = (_NO_BACKUP_WITH_CONTACTS,)
-        bounds = scene.robot.bounds().within(self.limits)
+        self.limits, self._v_shape = limits or Limits(), (scene.robot.model.nv,)
+        self.avoidance, self._no_backup = within_contacts(avoidance or Avoidance(), self.has_contacts, bool(dynamics))
+        torques, bounds = make_dynamics(
+            dynamics, scene.robot, self.limits, self.avoidance, dt,
+            contacts=contacts, latency=latency, planning=planning,
+        )  # fmt: skip
         blocks = sensing or Sensing(), progress or Progress()
-        if budget is not None and not isinstance(budget, Budget):
-            if not budget > 0.0:
-                raise ConfigError(f"budget: {budget} s, expected more than 0; it is in seconds")
-            budget = Budget(budget)
         settings = ControlSettings(
-            scene, bounds, self.avoidance, self.limits, dt, latency, *blocks, budget or UNLIMITED
+            scene, bounds, self.avoidance, self.limits, dt, latency, *blocks, make_budget(budget), torques
         )
         self._builder = ProblemBuilder(settings, self.tasks, contacts)
         self._arbiter = Arbiter(settings, law, self._builder.rows, self._builder.tracker)
@@ -148,10 +142,10 @@ class Controller(SceneChanges, SplitStep):
         """Run the first steps, with a law that ships: one of the user's own may remember what it is asked."""
         q, v, law = self.scene.robot.home, np.zeros(self._v_shape), self._arbiter.solver
         self._arbiter.solver = make_solver("qp")
-        self.tick(q)
-        self.filter(q, v)
-        self.rows(q)
-        self.rows(q)
+        self.tick(q, v=v)
+        self.filter(q, v, v=v)
+        self.rows(q, v=v)
+        self.rows(q, v=v)
         self.command(v)
         self._builder.rows.clearance_lower_bound(v, 0, self.dt)
         self._builder.rows.leaves_position_limits(q, v, self.dt)
@@ -162,7 +156,7 @@ class Controller(SceneChanges, SplitStep):
         if self.scene.spare:
             passing = replace(Obstacle.at(_WARM_UP, Sphere(radius=0.05), [2.0, 0.0, 0.0]), moves=True)
             self.add_obstacle(passing)
-            self.tick(q)
+            self.tick(q, v=v)
             self.remove_obstacle(_WARM_UP)
         for query in self._builder.rows.query.table.queries:
             query.forget_guesses()
@@ -180,7 +174,8 @@ class Controller(SceneChanges, SplitStep):
         with located(str(source)):
             controller = cls(
                 parts.scene, parts.tasks, parts.solver, scenario.dt, scenario.avoidance, scenario.limits,
-                scenario.sensing, scenario.progress, parts.contacts, scenario.latency, scenario.planning,
+                scenario.sensing, scenario.progress, parts.contacts, scenario.latency, scenario.planning, None,
+                scenario.dynamics,
             )  # fmt: skip
         for c in scenario.obstacles:
             if c.attached_to is not None:
@@ -227,7 +222,7 @@ class Controller(SceneChanges, SplitStep):
                 (k, 18) as `Sample.row`, or (k, 7), position and quaternion x y z w, if no velocity is known; of some
                 obstacles, as {(name, ...): array}.
             v: velocity (nv,) as measured, from which acceleration limits count in the first step, after a gap and after
-                `reset`. In all other steps they count from the last command, as those of servos that lag have to.
+                `reset`, else from the last command, as for servos that lag; with `dynamics`, all counts from it.
 
         Raises:
             NumericalError: an argument of the wrong shape, or not made of numbers.
@@ -296,6 +291,8 @@ class Controller(SceneChanges, SplitStep):
             solution = planning.decide(step)
         else:
             solution = arbiter.decide(step.q, step.t, step.is_settled, from_tasks)
+        if builder.rows.dynamics is not None:
+            solution = builder.rows.torques(solution)
         builder.remember(solution.v)
         assumptions = step.assumptions
         if self._no_backup and len(builder.tracker.moving):

@@ -16,6 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from qpavoid.budget import UNLIMITED, Budget
+from qpavoid.dynamics import StepDynamics
 from qpavoid.errors import NumericalError
 from qpavoid.reason import Reason, Severity
 
@@ -106,14 +107,8 @@ class Contacts(NamedTuple):
     """(c,) velocity of these frames that corrects their sliding [m/s, rad/s]."""
 
     def project(self, v: Array) -> Array:
-        """Return the velocity (nv,) closest to v with J v = b.
-
-        That is v itself where it meets the rows to `CONTACT_TOLERANCE`.
-
-        Args:
-            v: velocity (nv,) [rad/s or m/s].
-        """
-        if np.abs(self.J @ v - self.b).max() <= CONTACT_TOLERANCE:
+        """Return the velocity (nv,) closest to v with J v = b: v itself if it meets that to `CONTACT_TOLERANCE`."""
+        if np.abs(self.J @ v - self.b).max(initial=0.0) <= CONTACT_TOLERANCE:
             return v
         return np.asarray(self.v_particular + self.Z @ (self.Z.T @ v))
 
@@ -185,6 +180,14 @@ class Problem(NamedTuple):
     """Distance to the nearest position limit [rad, m]; negative where a coordinate is outside."""
     budget: Budget = UNLIMITED
     """Time that is left of the control step: a law that takes longer may `check` it, which ends the step."""
+    dynamics: StepDynamics | None = None
+    """Dynamics of the robot, with rows that a law has to meet beside those of `avoidance`; None at velocity level."""
+
+    @property
+    def inequalities(self) -> tuple[Array, Array]:
+        """Return all rows J (k + m, nv) and b (k + m,) with J v >= b: of the pairs, then of the dynamics."""
+        (_, _, J, b, *_), x = self.avoidance, self.dynamics
+        return (J, b) if x is None else (np.concatenate((J, x.J)), np.concatenate((b, x.b)))
 
 
 def make_problem(
@@ -252,6 +255,14 @@ class Solution(NamedTuple):
     """Largest change of the solver's raw velocity by the limits [rad/s or m/s]; 0 of a `bounded` solver."""
     plan: str = ""
     """Plan that is followed in place of the tasks alone, and why, in a sentence; empty without one."""
+    forces: dict[str, Array] | None = None
+    """Force (k, 3) of the ground on each corner of a contact, by its frame, world [N]; None without such."""
+    external: Array | None = None
+    """(nv,) torque from outside, of a momentum observer [Nm or N]; None without one."""
+    torque: Array | None = None
+    """(n_actuated,) torques that lead to `v` [Nm or N], within their limits; None at velocity level."""
+    acceleration: Array | None = None
+    """(nv,) acceleration of these torques [rad/s² or m/s²]."""
     build_time: float = 0.0
     """Time to read the state and set up the problem [s]; of `qp` with the QP, where both are one compiled call."""
     solve_time: float = 0.0

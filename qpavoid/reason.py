@@ -43,6 +43,19 @@ class ReasonKind(str, Enum):
     """The same of its upper position limit."""
     AT_VELOCITY_LIMIT = "AT_VELOCITY_LIMIT"
     """A joint moves at its velocity limit where a row demands more: the joint, its velocity [rad/s or m/s]."""
+    TOUCHED = "TOUCHED"
+    """A torque from outside is beyond its threshold: the joint, that torque [Nm or N]; an alarm where it stops the
+    robot."""
+    AT_TORQUE_LIMIT = "AT_TORQUE_LIMIT"
+    """A joint is at its torque limit where a row demands more: the joint, its torque [Nm or N]."""
+    AT_FRICTION_LIMIT = "AT_FRICTION_LIMIT"
+    """A force of a contact is at the edge of its friction cone, or at its least or greatest: the frame."""
+    TORQUE_SATURATED = "TORQUE_SATURATED"
+    """The torque of a velocity was cut at its limit, and another velocity follows from it: the joint, the excess
+    [Nm or N]."""
+    HOLDING_RELAXED = "HOLDING_RELAXED"
+    """Gravity takes more of a joint's torque than it should, or soon will: the joint, by how much faster than its row
+    allows, as a share of its limit [1/s]."""
     STALLED = "STALLED"
     """The tasks make no progress: a pair that holds them, its share of the forces that balance their pull on the joints
     [%], more than 10; no share of laws without rows, no pair where several hold them together."""
@@ -57,7 +70,7 @@ class ReasonKind(str, Enum):
     PLAN = "PLAN"
     """Of logs: a plan is followed in place of the tasks alone; `detail` says since when, and why."""
     NO_PLAN = "NO_PLAN"
-    """Nothing is forecast or planned, or not all that is configured: what excludes it."""
+    """Nothing is forecast or planned, or not all that is wanted: what excludes it; `detail` says why."""
     BUDGET_SPENT = "BUDGET_SPENT"
     """The robot brakes, or follows its backup trajectory, as the budget of the control step was spent: before what."""
     STALE = "STALE"
@@ -82,8 +95,6 @@ class ReasonKind(str, Enum):
     """No velocity within the joint limits meets the contacts: `contacts`."""
     PRIORITY_UNSOLVED = "PRIORITY_UNSOLVED"
     """No back end could solve the QP of a priority level: the level."""
-    NOT_PLANNED = "NOT_PLANNED"
-    """No path is planned: why, in `detail`."""
     START_TOO_NEAR = "START_TOO_NEAR"
     """A path would begin in contact: the pair, its distance [m]."""
     GOAL_TOO_NEAR = "GOAL_TOO_NEAR"
@@ -128,6 +139,11 @@ _TEXTS: dict[str, str] = {
     "AT_LOWER_LIMIT": "at its lower limit, velocity bound",
     "AT_UPPER_LIMIT": "at its upper limit, velocity bound",
     "AT_VELOCITY_LIMIT": "at its velocity limit,",
+    "TOUCHED": "is touched by",
+    "AT_TORQUE_LIMIT": "at its torque limit,",
+    "AT_FRICTION_LIMIT": "a force of the contact is at the limit of its cone",
+    "TORQUE_SATURATED": "torque limit cuts",
+    "HOLDING_RELAXED": "gravity takes too much of its torque, row relaxed by",
     "STALLED": "no progress",
     "OUT_OF_REACH": "out of reach by",
     "SINGULAR": "in a singularity, short of its target by",
@@ -147,7 +163,6 @@ _TEXTS: dict[str, str] = {
     "SOLVER_FAILED": "no usable velocity",
     "CONTACTS_INFEASIBLE": "joint limits leave no velocity that holds them",
     "PRIORITY_UNSOLVED": "no back end could solve its QP",
-    "NOT_PLANNED": "no path is planned",
     "START_TOO_NEAR": "a path would begin in contact, distance",
     "GOAL_TOO_NEAR": "no goal of the path is clear",
     "NOT_ATTAINED": "no configuration attains the targets",
@@ -164,7 +179,7 @@ class Reason(NamedTuple):
     amount: float | None = None
     """Amount in `unit`, where the kind has one."""
     unit: str = ""
-    """Unit of `amount`: m, m/s, rad, rad/s, s, % or - ."""
+    """Unit of `amount`: m, m/s, rad, rad/s, s, 1/s, Nm, N, % or - ."""
     severity: Severity = Severity.WARNING
     detail: str = ""
     """More for people, not for programs."""

@@ -42,10 +42,11 @@ def started(spec, robot):
     return model, data
 
 
-def least_distance(panda, solver="qp", seed=0):
+def least_distance(panda, solver="qp", seed=0, speed=0.3, d2=0.12):
     """Least distance to a ball that flies at the arm, and a board that a camera sees [m], of a loop at 500 Hz.
 
-    Servos lag, encoders are noisy and two periods late, a camera at 30 Hz is 60 ms late and noisy.
+    Servos lag, encoders are noisy and two periods late, a camera at 30 Hz is 60 ms late and noisy. The target swings as
+    much faster as the ball.
     """
     rng, dt, late, spec = np.random.default_rng(seed), 0.002, 0.06, panda_spec(panda)
     ball = spec.worldbody.add_body(name="ball", mocap=True, pos=[0.9, 0.0, 0.5])
@@ -54,11 +55,11 @@ def least_distance(panda, solver="qp", seed=0):
     board.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, size=[0.2, 0.01, 0.2])
     spec.worldbody.add_camera(name="eye", pos=[1.2, 0.8, 0.8], xyaxes=[-0.6, 0.8, 0.0, -0.3, -0.2, 0.9], fovy=50)
     model, data = started(spec, panda)
-    balls = obstacles_of(model, data, ["ball"], uncertainty=0.005)
+    balls = obstacles_of(model, data, ["ball"], uncertainty=0.01)
     cloud = Obstacle.at("eye", PointCloud(resolution=0.02), [0.0, 0.0, 0.0])
     tasks = build_tasks([Task(frame=TOOL, type="pose"), PostureTask(weight=1e-3)], panda, panda.home)
     latency = LAG + 2 * dt
-    avoidance = Avoidance(d1=0.03, d2=0.12)
+    avoidance = Avoidance(d1=0.03, d2=d2)
     controller = Controller(
         build_scene(panda, [*balls, cloud]), tasks, solver, dt, avoidance=avoidance, latency=latency
     )
@@ -73,9 +74,9 @@ def least_distance(panda, solver="qp", seed=0):
             seen["eye"] = Points(camera_points(model, data, "eye", ["ball"]), t=t)
             pictures.append((t + late, seen))
         news = pictures.popleft()[1] if pictures and pictures[0][0] <= t else None
-        target = {TOOL: [0.4, -0.3 * np.sin(t), 0.45]}  # it leads into the board
+        target = {TOOL: [0.4, -0.3 * np.sin(t * speed / 0.3), 0.45]}  # it leads into the board
         plug.command(data, controller.step(encoders[0], t, target, news).v)
-        data.mocap_pos[0] = [max(0.9 - 0.3 * t, 0.3), 0.0, 0.5]  # it comes to rest where the tool was
+        data.mocap_pos[0] = [max(0.9 - speed * t, 0.3), 0.0, 0.5]  # it comes to rest where the tool was
         mujoco.mj_step(model, data, 2)
         if k % 10 == 0:
             distances = ruler.distances(plug.q(data), {0: Sample.at(data.mocap_pos[0])})
@@ -83,11 +84,11 @@ def least_distance(panda, solver="qp", seed=0):
     return least
 
 
-@pytest.mark.parametrize("seed", [0, 1])
-def test_a_loop_at_500_hz_with_lag_delay_and_noise_keeps_its_distance(panda, seed):
-    """15 mm of the 30 mm asked for, where the tracking law collides."""
-    assert least_distance(panda, seed=seed) > 0.015
-    assert least_distance(panda, "tracking", seed=seed) < 0.0
+@pytest.mark.parametrize(("seed", "speed", "d2"), [(0, 0.3, 0.12), (2, 0.6, 0.3)])
+def test_a_loop_at_500_hz_with_lag_delay_and_noise_keeps_its_distance(panda, seed, speed, d2):
+    """15 mm of the 30 mm asked for, where the tracking law collides; what is fast needs a larger d2."""
+    assert least_distance(panda, "qp", seed, speed, d2) > 0.015
+    assert least_distance(panda, "tracking", seed, speed, d2) < 0.0
 
 
 @pytest.mark.parametrize("gear", [1.0, 2.0])

@@ -25,7 +25,7 @@ from qpavoid.config import Box, Capsule, Cone, Cylinder, Ellipsoid, HalfSpace, L
 from qpavoid.model.kinematics import ForwardKinematics
 from qpavoid.model.trajectory import build_motion, still
 from qpavoid.reason import ReasonKind
-from qpavoid.run.simulate import Recorder
+from qpavoid.run.recorder import Recorder
 from qpavoid.viz.figures import plot_compare, plot_run
 
 TCP, DT = "panda_hand_tcp", 0.01

@@ -19,7 +19,7 @@ from qpavoid.solvers import SOLVERS
 METRICS = {
     "scenario", "solver", "completed", "collided", "min_distance", "min_pair", "time_in_collision", "time_below",
     "final_error", "max_deviation", "tracking_rmse", "peak_velocity", "jitter", "status_counts", "relaxed_ticks",
-    "tick_us", "time_blocked", "severity_counts", "events",
+    "tick_us", "time_blocked", "severity_counts", "events", "torque",
 }  # fmt: skip
 SITUATION = yaml.safe_load((data_folder("tasks") / "situation1.yaml").read_text(encoding="utf-8"))
 

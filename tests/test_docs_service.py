@@ -31,5 +31,6 @@ def test_service_page_has_the_limits():
 
 def test_service_page_options_exist(cli):
     shown = cli("serve", "--help").stdout
-    for option in {"--set", "--solver", "--port", "--host", "--heartbeat"}:
+    assert "[s]" in shown
+    for option in {"--set", "--solver", "--port", "--host", "--heartbeat", "--motions"}:
         assert option in shown and option in PAGE

@@ -1,5 +1,6 @@
 """The contract of docs/embedding.md: threads, clones, the same bits, joints by name, periods, watchdog."""
 
+import gc
 import subprocess
 import sys
 import threading
@@ -47,6 +48,21 @@ def drive(controller, steps=200, phase=0.0):
         out.append(controller.step(q, t, {TOOL: target}, ball).v)
         q = q + DT * out[-1]
     return np.array(out)
+
+
+def test_steps_leave_nothing_to_the_garbage_collector(panda):
+    """With what a program has imported frozen, as the page advises, its walks find nothing and are short."""
+    controller = make_controller(panda)
+    drive(controller, 20)
+    gc.collect()
+    gc.freeze()
+    gc.disable()
+    try:
+        drive(controller, 100)
+        assert gc.collect() == 0
+    finally:
+        gc.enable()
+        gc.unfreeze()
 
 
 # --- the same answer ----------------------------------------------------------------------------------------------

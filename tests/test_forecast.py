@@ -7,7 +7,9 @@ from qpavoid import (
     Controller,
     Limits,
     Obstacle,
+    Robot,
     Sample,
+    ScenarioConfig,
     Status,
     build_scene,
     build_tasks,
@@ -28,15 +30,21 @@ TOO_FAR = (0.0, 0.3, 0.0)
 5/s, 2 mm."""
 
 
-def forecast(scenario):
-    """Forecast of a scenario from its start, until its end."""
+def make_forecaster(scenario):
+    """Forecaster of a scenario, and the state in which it begins."""
     parts = build_parts(scenario)
     bounds = parts.scene.robot.bounds().within(scenario.limits)
     avoidance = scenario.avoidance.model_copy(update={"backup": not scenario.contacts})
     settings = ControlSettings(parts.scene, bounds, avoidance, scenario.limits, scenario.dt)
     forecaster = Forecaster(settings, parts.tasks, parts.contacts, scenario.solver, Planning())
     zero = np.zeros(parts.scene.robot.model.nv)
-    return forecaster.run(Snapshot(0.0, parts.q0, zero, zero, TRACK, {}, {}), scenario.duration)
+    return forecaster, Snapshot(0.0, parts.q0, zero, zero, TRACK, {}, {})
+
+
+def forecast(scenario):
+    """Forecast of a scenario from its start, until its end."""
+    forecaster, start = make_forecaster(scenario)
+    return forecaster.run(start, scenario.duration)
 
 
 @pytest.mark.parametrize(
@@ -146,3 +154,26 @@ def test_excluded_laws_are_named(panda):
     assert (reason.kind, reason.subject) == (ReasonKind.NO_PLAN, ("solver",))
     controller = Controller(build_scene(panda), (), "qp", planning=Planning(fast=FastFinish(gain=3.0)))
     assert controller.step(panda.home).assumptions[0].subject == ("tasks",)
+
+
+def test_paths_attain_poses_of_frames_and_between_them():
+    """What a path leads to is where tasks want frames, in the axes of another one if they are seen from it."""
+    left, right = Robot.load("baxter").end_effectors[:2]
+    tasks = [
+        {"frame": left, "motion": {"type": "line", "displacement": [0.0, 0.1, 0.0], "speed": 0.1}},
+        {"type": "relative", "frame": right, "relative_to": left},
+    ]
+    scenario = ScenarioConfig.model_validate({"robot": "baxter", "duration": 1.0, "tasks": tasks})
+    forecaster, start = make_forecaster(scenario)
+    first, last = (forecaster.targets_at(start, t) for t in (0.0, 5.0))
+    assert set(last) == {left, (right, left)}
+    np.testing.assert_allclose(last[left] - first[left], [0.0, 0.1, 0.0], atol=1e-12)
+    assert np.array_equal(last[right, left].position, first[right, left].position)
+
+
+def test_paths_refuse_a_centre_of_mass_by_name(panda):
+    tasks = build_tasks([config.Task(frame="panda_hand_tcp"), config.ComTask(axes="xy")], panda, panda.home)
+    controller = Controller(build_scene(panda), tasks, planning=Planning())
+    (reason,) = controller.step(panda.home).assumptions
+    assert reason.kind is ReasonKind.NO_PLAN
+    assert "centre of mass" in str(reason)

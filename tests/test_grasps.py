@@ -12,6 +12,7 @@ from qpavoid import ConfigError, Obstacle, Robot
 from qpavoid.config import Sphere
 from qpavoid_bench.arena.commands import app
 from qpavoid_bench.grasps.clearance import measure
+from qpavoid_bench.grasps.closed_loop import ENTRANTS, run_grasp
 from qpavoid_bench.grasps.problems import load_problems
 
 START = {"panda_joint2": -0.785, "panda_joint4": -2.356, "panda_joint6": 1.571, "panda_finger_joint1": 0.065}
@@ -86,3 +87,16 @@ def test_what_is_no_problem_set_is_said_in_one_line(tmp_path, content):
     with pytest.raises(ConfigError, match="problem set") as error:
         load_problems(tmp_path)
     assert "\n" not in str(error.value)
+
+
+def test_closed_loop_reaches_the_pose_without_contact(problem_set):
+    """With nothing in the way the law arrives; a hand that is held off by a ball at its goal does not."""
+    (free,) = load_problems(problem_set(BALL))
+    result = run_grasp(free, ENTRANTS[0])
+    assert result.is_success and result.distance <= 1e-3 and 0.0 < result.time < 6.0
+    assert result.excess <= 1e-9 and result.clearance > 0.0
+    at = list(map(float, free.goal_poses["panda_hand_tcp"].position))
+    (blocked,) = load_problems(problem_set({**BALL, "position": at}))
+    result = run_grasp(blocked, ENTRANTS[0])
+    assert result.is_clear and not result.is_reached and np.isnan(result.time)
+    assert result.distance > 0.005

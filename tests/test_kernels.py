@@ -540,7 +540,8 @@ def test_backup_rows_are_those_of_enabled_pairs_without_contact(paper, seed):
     contact, influence = np.quantile(distance[pairs], [0.2, 0.8])
     near = [i for i in pairs.tolist() if distance[i] < influence and before[i]]
     kept = [i for i in near if distance[i] >= contact]
-    k, touching, nearest, second = run("backup_rows", x, step.q, pairs, influence, True, enabled, contact)
+    bounds = np.full(len(step.pairs), np.inf)
+    k, touching, nearest, second = run("backup_rows", x, step.q, pairs, bounds, influence, True, enabled, contact)
     assert x.near_pairs[:k].tolist() == kept and 0 < k < len(pairs)
     assert touching == len(near) - len(kept) > 0
     assert nearest == min(distance[near]) and second == min(distance[kept])
@@ -558,8 +559,21 @@ def test_backup_rows_take_nan_for_contact(paper):
     results, pairs, enabled = np.array(step.x.results), np.arange(3), np.ones(len(step.pairs), dtype=bool)
     results[:3, 0] = 0.1, np.nan, 0.2
     x = step.x._replace(results=results)
-    k, touching, nearest, _ = run("backup_rows", x, step.q, pairs, np.inf, False, enabled, -np.inf)
+    bounds = np.full(len(step.pairs), np.inf)
+    k, touching, nearest, _ = run("backup_rows", x, step.q, pairs, bounds, np.inf, False, enabled, -np.inf)
     assert (k, touching) == (2, 1) and np.isnan(nearest) and enabled[:3].tolist() == [True, False, True]
+
+
+def test_backup_rows_take_the_lower_bound_as_clearance_and_the_result_as_distance(paper):
+    step = Step(paper, 0)
+    results, pairs, bounds = np.array(step.x.results), np.arange(3), np.full(len(step.pairs), np.inf)
+    results[:3, 0], bounds[1] = [0.4, 0.3, 0.5], 0.25
+    x = step.x._replace(results=results)
+    margin, allowance = (x.margin[x.twist_row[:3]], x.distance_allowance[:3])
+    everything = np.ones(len(step.pairs), dtype=bool)
+    k, _, nearest, second = run("backup_rows", x, step.q, pairs, bounds, np.inf, False, everything, 0.0)
+    assert k == 3 and nearest == second == min([0.4, 0.25, 0.5] - margin + allowance)
+    np.testing.assert_array_equal(x.closest[:3, 0], [0.4, 0.3, 0.5] - margin)
 
 
 @pytest.mark.parametrize("seed", SEEDS)

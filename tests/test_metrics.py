@@ -23,13 +23,13 @@ def make_log(ticks: int, meta: dict | None = None, **arrays) -> Log:
     shapes = {
         "q": (2,), "v": (2,), "target": (1, 3), "tool": (1, 3), "tool_rotation": (1, 3, 3), "turn_error": (1,),
         "body_distance": (2,), "body_pair": (2,), "body_ends": (2, 2, 3), "obstacle_position": (1, 3),
-        "obstacle_rotation": (1, 3, 3),
+        "obstacle_rotation": (1, 3, 3), "torque": (0,), "contact_force": (0, 3), "slip": (0,),
     }  # fmt: skip
     rows = {f.name: np.zeros((ticks, *shapes.get(f.name, ()))) for f in fields(Log) if f.name != "meta"}
     rows |= {"t": DT * np.arange(ticks), "body_distance": np.full((ticks, 2), np.inf)}
     rows |= {"closest_pair": np.full(ticks, -1), "status": np.zeros(ticks, dtype=np.int8)}
     config = {"dt": DT, "goal_tolerance": 0.2, "thresholds": [0.0, 0.1, 0.2]}
-    names = {"scenario": "by hand", "solver": "qp", "completed": True, "stopped_by": None}
+    names = {"scenario": "by hand", "solver": "qp", "completed": True, "stopped_by": None, "torque_limit": []}
     names["events"] = [
         [0.1 * i, "RELAXED", [Reason.of(ReasonKind.ROW_RELAXED, "hand", "ball", amount=0.1 * i, unit="m/s").as_dict()]]
         for i in range(min(ticks, 3))
@@ -77,6 +77,7 @@ def test_every_figure_of_a_run(log):
         "tracking_rmse": pytest.approx(np.sqrt((0.3**2 + 0.5**2 + 1.0**2 + 0.1**2) / 5)),
         "peak_velocity": 3.0,
         "jitter": pytest.approx(3 + 3 + 4 + 4),
+        "torque": None,
         "status_counts": {"SOLVED": 2, "RELAXED": 2, "STOPPED": 1},
         "relaxed_ticks": 2,
         "shortened_ticks": 2,
@@ -85,6 +86,13 @@ def test_every_figure_of_a_run(log):
         "events": log.meta["events"],
         "tick_us": {"p50": pytest.approx(30.0), "p99": pytest.approx(97.6), "max": pytest.approx(100.0)},
     }
+
+
+def test_figures_of_motors():
+    """Σ|Δτ| of 1 + 4 + 2 Nm in 0.3 s; a motor without a limit uses no share of it."""
+    torque, slip = [[0.0, 1.0], [1.0, 5.0], [1.0, 3.0]], [[0.0], [2e-3], [1e-3]]
+    metrics = make_log(3, {"torque_limit": [2.0, None]}, torque=torque, slip=slip).metrics()
+    assert metrics["torque"] == {"share": 0.5, "jitter": pytest.approx(7.0 / 0.3), "slip": 2e-3}
 
 
 def test_contact_without_penetration_is_no_collision():

@@ -247,4 +247,4 @@ def test_what_cannot_be_planned_is_refused():
     base = Robot.load("g1")
     if base.model.nq != base.model.nv:
         path = plan_to(build_scene(base), base.home, base.home)
-        assert path.reason.kind is ReasonKind.NOT_PLANNED and "several coordinates" in str(path.reason)
+        assert path.reason.kind is ReasonKind.NO_PLAN and "several coordinates" in str(path.reason)

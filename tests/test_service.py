@@ -66,8 +66,8 @@ def serve(scenario):
     """Begins a service in a thread; gives it, and clients of it."""
     running, clients = [], []
 
-    def begin(heartbeat=HEARTBEAT):
-        service = Service(*Controller.from_scenario(scenario), heartbeat=heartbeat, port=0)
+    def begin(heartbeat=HEARTBEAT, served=scenario, motions=False):
+        service = Service(served, heartbeat, port=0, follows_motions=motions)
         thread = threading.Thread(target=service.run)
         thread.start()
         running.append((service, thread))
@@ -104,7 +104,8 @@ def test_answers_are_the_controllers_own(serve, scenario):
     turn = pin.Quaternion(pin.rpy.rpyToMatrix(0.1, 0.2, 0.3))
     for k in range(40):
         t, place = k * DT, np.array([0.45 - 0.002 * k, 0.1, 0.5])
-        ball, sent = Sample.at(place, linear=[-0.2, 0.0, 0.0]), {"position": place.tolist(), "linear": [-0.2, 0.0, 0.0]}
+        ball = Sample.at(place, turn.toRotationMatrix(), linear=[-0.2, 0.0, 0.0])  # turned as it was sent before
+        sent = {"position": place.tolist(), "linear": [-0.2, 0.0, 0.0]}
         if k % 3 == 0:
             ball, sent = Pose.at(place, turn.toRotationMatrix(), t=t - 0.005), {
                 "position": place.tolist(), "quaternion": turn.coeffs().tolist(), "t": t - 0.005,
@@ -201,8 +202,8 @@ def test_wrong_messages_are_refused_by_name_and_change_nothing(serve, scenario):
         answer = ask.raw(wrong if isinstance(wrong, bytes) else msgpack.packb({**GOOD, **wrong}))
         assert (answer["type"], answer["error"]) == ("error", fault), (wrong, answer)
         assert words in answer["text"] and answer["text"].isprintable(), (wrong, answer)
-        if isinstance(wrong, dict) and "seq" not in wrong:
-            assert answer["seq"] == 7
+        if isinstance(wrong, dict):
+            assert answer["seq"] == (7 if "seq" not in wrong else None)
         step()
     good = msgpack.packb({**GOOD, "obstacles": {"camera": {"points": 0}}})
     assert ask.raw(good, b"\x00" * 13)["text"].endswith("32-bit numbers")
@@ -210,6 +211,10 @@ def test_wrong_messages_are_refused_by_name_and_change_nothing(serve, scenario):
     assert ask.raw(good, *[b""] * 5)["error"] == "OVERSIZED"
     step()
     counts = ask.ask("status")["counts"]
+    cut_off = msgpack.packb(GOOD)[:-9]
+    assert (ask.raw(cut_off)["error"], ask.raw(cut_off)["seq"]) == ("MALFORMED", 7)
+    no_seq = {name: value for name, value in GOOD.items() if name != "seq"}
+    assert ask.raw(msgpack.packb({**no_seq, "speed": 1.0}))["seq"] == 0  # as of all that leave it out
     assert counts["step"] >= len(WRONG) and counts["OVERSIZED"] == 3 and counts["VERSION"] == 2
 
 
@@ -306,6 +311,8 @@ def test_lost_heartbeat_is_a_stop_within_the_limits(serve, scenario):
     assert refused["error"] == "HALTED" and "reset" in refused["text"]
     assert robot.ask("reset")["type"] == "done"
     assert robot.ask("step", q=q.tolist())["type"] == "command"
+    status = robot.ask("status")
+    assert status["halts"] >= 1 and status["counts"]["HALTED"] >= 1  # halts are no refusals
 
 
 def test_one_client_is_in_control(serve):
@@ -351,8 +358,78 @@ def test_obstacles_come_and_go_and_are_held(serve):
 
 def test_ports_and_heartbeats_that_cannot_be_had(serve, scenario):
     service, _ = serve()
-    made = Controller.from_scenario(scenario)
     with pytest.raises(ConfigError, match="--port"):
-        Service(*made, port=int(service.endpoint.rpartition(":")[2]))
+        Service(scenario, port=int(service.endpoint.rpartition(":")[2]))
     with pytest.raises(ConfigError, match="heartbeat"):
-        Service(*made, heartbeat=DT, port=0)
+        Service(scenario, heartbeat=DT, port=0)
+
+
+def walk(client, model, q, steps, **fields):
+    """Follow commands; `fields` in the first step alone. Returns the last configuration and command."""
+    for k in range(steps):
+        command = client.ask("step", q=q.tolist(), **(fields if k == 0 else {}))
+        assert command["type"] == "command", command
+        q = pin.integrate(model, q, DT * np.array(command["v"]))
+    return q, command
+
+
+@pytest.fixture(scope="module")
+def moving(scenario, tmp_path_factory):
+    """The scenario, with a tool that would go on a line, and a ball that would come."""
+    line = {"type": "line", "displacement": [0.0, 0.4, 0.0], "speed": 0.2}
+    come = {"type": "line", "start": [0.9, 0.0, 0.5], "end": [0.3, 0.0, 0.5], "speed": 0.3, "rpy": [0.1, 0.2, 0.3]}
+    first, *others = SCENARIO["obstacles"]
+    path = tmp_path_factory.mktemp("service") / "moving.yaml"
+    tasks = [{"frame": TOOL, "type": "pose", "motion": line}, SCENARIO["tasks"][1]]
+    path.write_text(yaml.safe_dump({**SCENARIO, "tasks": tasks, "obstacles": [{**first, "motion": come}, *others]}))
+    return load_scenario(str(path))
+
+
+def test_what_is_not_sent_is_held_and_what_was_never_sent_stands(serve, moving):
+    """Neither tool nor ball follow the scenario; a target that was sent once, with a velocity, is reached and kept."""
+    robot = Controller.from_scenario(moving)[0].scene.robot
+    client, q0 = serve(served=moving)[1](), robot.home
+    elsewhere = q0 + 0.1 * np.arange(7) / 7.0  # not where the scenario begins
+    q, command = walk(client, robot.model, elsewhere, 150)
+    np.testing.assert_allclose(q, elsewhere, atol=1e-4)
+    assert command["status"] == "SOLVED" and not command["stalled"]  # the ball would be in the arm by now
+
+    def tool(q):
+        data = robot.model.createData()
+        pin.framesForwardKinematics(robot.model, data, q)
+        return data.oMf[robot.frame_id(TOOL, "test")].translation.copy()
+
+    goal = tool(q) + np.array([0.0, 0.1, 0.05])
+    sent = {TOOL: {"position": goal.tolist(), "linear": [0.0, 0.2, 0.0]}}
+    q, command = walk(client, robot.model, q, 400, targets=sent)
+    np.testing.assert_allclose(tool(q), goal, atol=1e-2)  # the posture pulls a little
+    assert np.abs(command["v"]).max() < 2e-2
+    assert client.ask("step", q=[60.0] * 7)["status"] == "STOPPED"  # degrees: no place to hold
+    assert client.ask("reset")["type"] == "done"  # forgotten: it stays where it is
+    after, _ = walk(client, robot.model, q, 100)
+    np.testing.assert_allclose(tool(after), tool(q), atol=1e-3)
+
+
+def test_scenarios_motions_are_followed_if_asked_for(serve, moving):
+    controller, q = Controller.from_scenario(moving)
+    client = serve(served=moving, motions=True)[1]()
+    client.ask("reset")
+    for k in range(20):
+        mine, theirs = controller.step(q, k * DT), client.ask("step", q=q.tolist(), t=k * DT)
+        np.testing.assert_array_equal(theirs["v"], mine.v)
+        q = pin.integrate(controller.scene.robot.model, q, DT * mine.v)
+    assert np.abs(mine.v).max() > 0.05
+
+
+def test_obstacles_that_are_left_out_again_stop_the_robot(serve, moving):
+    """They stay where they were sent, also through a reset, and are stale from some time on, unless they rest."""
+    client, q = serve(served=moving)[1](), GOOD["q"]
+    client.ask("step", q=q, t=0.0, obstacles={"ball": {"position": [0.8, 0.0, 0.5]}})
+    assert client.ask("step", q=q, t=0.3)["reasons"] == []
+    assert client.ask("reset")["type"] == "done"
+    client.ask("step", q=q, t=5.0)
+    stopped = client.ask("step", q=q, t=5.7)
+    assert stopped["status"] == "STOPPED" and stopped["reasons"][0]["subject"] == ["ball"]
+    client.ask("step", q=q, t=5.71, obstacles={"ball": {"position": [0.8, 0.0, 0.5], "at_rest": True}})
+    for t in (8.0, 16.0):
+        assert client.ask("step", q=q, t=t)["status"] == "SOLVED"

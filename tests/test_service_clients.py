@@ -57,8 +57,9 @@ def test_clients_are_short():
     assert len((CLIENTS / "client.cpp").read_text().splitlines()) <= 40
 
 
-def test_server_stops_the_robot_before_it_ends(server):
-    """Ctrl-C while it moves: the last commands brake to zero."""
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_server_stops_the_robot_before_it_ends(server, number):
+    """Asked to end while it moves: the last commands brake to zero, and say why."""
     process, requests, commands = server
     context = zmq.Context()
     ask, stream = context.socket(zmq.REQ), context.socket(zmq.SUB)
@@ -74,7 +75,7 @@ def test_server_stops_the_robot_before_it_ends(server):
     for k in range(30):
         q = q + 0.01 * np.array(answer(type="step", q=q.tolist(), t=0.01 * k,
                                        targets={"panda_hand_tcp": {"position": [0.4, 0.5, 0.5]}})["v"])  # fmt: skip
-    process.send_signal(signal.SIGINT)
+    process.send_signal(number)
     assert process.wait(60) == 0
     received = []
     while stream.poll(500):
@@ -82,7 +83,7 @@ def test_server_stops_the_robot_before_it_ends(server):
     context.destroy(0)
     speeds = [np.abs(command["v"]).max() for command in received]
     assert max(speeds) > 0.1 and speeds[-1] == 0.0
-    assert received[-1]["reasons"][0]["kind"] == "HEARTBEAT_LOST"
+    assert received[-1]["reasons"][0]["kind"] == "SERVER_ENDS"
 
 
 def test_bench_serve_prints_percentiles(tmp_path):

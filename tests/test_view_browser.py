@@ -151,6 +151,7 @@ def test_page_shows_and_steers_a_run(session, page, empty_picture):
     page.on("pageerror", lambda error: errors.append(str(error)))
     visit(page, session)
     page.get_by_text("rows").first.wait_for()
+    page.get_by_text("Drag the ball into the robot").wait_for()
     wait_for(lambda: session.t > 0.1, "the first steps: a run begins with the first browser")
     tool = session.tick.kinematics.position[0]
 
@@ -174,8 +175,10 @@ def test_page_shows_and_steers_a_run(session, page, empty_picture):
     choose(page, "qp", "eq10")
     wait_for(lambda: session.config.solver.label == "eq10", "the other solver")
     assert session.t > steps
+    assert not page.locator(".u-label", has_text="beside").count()  # no curve of a robot that is not there
     choose(page, "none", "tracking")
     wait_for(lambda: len(session.loops) == 2, "the robot beside")
+    page.locator(".u-label", has_text="beside").wait_for()
     choose(page, "eq10", "qp")
     wait_for(lambda: session.config.solver.label == "qp", "the first solver")
 

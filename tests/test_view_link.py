@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from qpavoid import Controller, Sample, load_scenario
+from qpavoid.control.scenario import build_parts
 from qpavoid.errors import ConfigError
 from qpavoid.run.simulate import Follower
 from qpavoid.viz import view as view_module
@@ -26,6 +27,7 @@ from qpavoid.viz.view_link import (
     received,
     send,
     send_event,
+    still_frame,
     unpack,
 )
 from qpavoid.viz.view_status import status_html
@@ -140,6 +142,19 @@ def test_status_names_the_closest_pair(tick):
     assert all(name in text for name in nearest)
     assert "SOLVED" in text
     assert "step 0.2 ms" in text
+    assert "step 120 ms, p99 120 ms" in status_html(tick, [0.12] * 3)
+
+
+def test_scene_is_shown_before_there_is_a_controller():
+    """The robot at its start, obstacles as at t = 0, and no status, so that the page says what it waits for."""
+    config = load_scenario("panda_drag")
+    parts = build_parts(config)
+    shown = still_frame(parts.scene, parts.tasks, parts.q0, config.avoidance)
+    frame = unpack(pack(shown))
+    np.testing.assert_array_equal(frame.q, parts.q0)
+    assert frame.text == "" and not len(frame.witnesses)
+    names = [obstacle.name for obstacle in parts.scene.slots]
+    np.testing.assert_array_equal(frame.obstacles[names.index("ball"), 9:], config.obstacles[0].motion.position)
 
 
 def test_missing_viser_is_one_line_with_a_remedy(monkeypatch, panda):

@@ -78,7 +78,7 @@ def test_wheel_holds_the_package_its_robots_and_scenarios(built):
     assert "qpavoid/_data/robots/paper-dual-arm/paper_dual_arm.urdf" in package
     assert {name.split("/")[0] for name in package} == {"qpavoid", "qpavoid_bench"}
     assert not any("__pycache__" in name or name.endswith((".npz", ".png")) for name in names)
-    assert any(name.endswith(".dist-info/licenses/LICENSE") for name in names)
+    assert {"LICENSE", "NOTICE.md"} <= {name.partition(".dist-info/licenses/")[2] for name in names}
 
 
 def test_sdist_builds_the_same_wheel(built, python, tmp_path):
@@ -88,8 +88,9 @@ def test_sdist_builds_the_same_wheel(built, python, tmp_path):
     assert modules(Path("bench")) | {"pyproject.toml", "README.md", "LICENSE", "robots/panda/robot.yaml"} <= names
     assert {f"tests/{path.name}" for path in (ROOT / "tests").glob("test_*.py")} <= names
     assert {f"docs/{path.name}" for path in (ROOT / "docs").glob("*.md")} <= names  # which tests read
+    assert {"mkdocs.yml", "Makefile", "CHANGELOG.md", "CITATION.cff", "CONTRIBUTING.md", "NOTICE.md"} <= names
     assert not any(name.startswith((".git/", ".ci", "out/")) for name in names)
-    assert {name.split("/")[1] for name in names if name.startswith("bench/")} == {"qpavoid_bench"}
+    assert {name.split("/")[1] for name in names if name.startswith("bench/")} == {"qpavoid_bench", "results"}
     options = ("--no-deps", "--no-build-isolation", "--quiet", "--wheel-dir")
     call(python, "-m", "pip", "wheel", *options, tmp_path, sdist, cwd=tmp_path)
     assert in_wheel(tmp_path / wheel.name) == in_wheel(wheel)

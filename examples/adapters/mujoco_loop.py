@@ -32,10 +32,10 @@ data = mujoco.MjData(model)
 data.qpos[:7] = robot.home
 mujoco.mj_forward(model, data)
 
-balls = obstacles_of(model, data, ["ball"], uncertainty=0.005)
+balls = obstacles_of(model, data, ["ball"], uncertainty=0.01)
 cloud = Obstacle.at("camera", PointCloud(resolution=0.02), [0.0, 0.0, 0.0])
 tasks = build_tasks([Task(frame="panda_hand_tcp", type="pose"), PostureTask(weight=1e-3)], robot, robot.home)
-avoidance, sensed = Avoidance(d1=0.03, d2=0.12), lag + 2 * dt  # what the encoders say late counts as lag
+avoidance, sensed = Avoidance(d1=0.03, d2=0.3), lag + 2 * dt  # 0.6 m/s, known 0.1 s late; late encoders count as lag
 controller = Controller(build_scene(robot, [*balls, cloud]), tasks, dt=dt, avoidance=avoidance, latency=sensed)
 plug = MujocoRobot(controller, model, ["ball"])
 

@@ -47,6 +47,10 @@ class ActionFilter:
             raise ConfigError(f"{controller.scene.robot.name}: a joint has no limits, or several coordinates; lock it")
         self.controller, self._clone = controller, controller.clone()
         self._speed, self._step = bounds.velocity, np.minimum(bounds.acceleration * controller.dt, _FAST)
+        none = np.zeros(model.nv)
+        self._velocity_towards = kernels.direct(
+            kernels.velocity_towards, none, none, none, self._speed, self._step, controller.dt, none.copy()
+        )
         self._setpoint: Array | None = None
         self._last: Array | None = None
         self._v = np.zeros(model.nv)
@@ -110,14 +114,9 @@ class ActionFilter:
             last: the action before (nq,).
             v_last: velocity (nv,) that led to `start`.
         """
-        dt, step = self.controller.dt, self._step
-        v = (action - start) / dt
-        speed, usual = np.abs(v), np.maximum(np.abs(action - last) / dt, step)
-        if (speed <= np.minimum(usual, self._speed)).all() and (np.abs(v - v_last) <= step).all():
-            return np.asarray(v)
-        fastest = np.maximum(kernels.speed_to_stop(speed * dt, step, dt), usual)
-        fastest = np.minimum(np.minimum(fastest, self._speed), np.maximum(np.sign(v) * v_last, 0.0) + step)
-        return np.asarray(v / np.max(speed / fastest, initial=1.0))
+        v: Array = np.empty_like(self._v)
+        self._velocity_towards(action - start, action - last, v_last, self._speed, self._step, self.controller.dt, v)
+        return v
 
 
 def _later(value: Any, duration: float) -> Any:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from math import isfinite
 from typing import Any
 
 import numpy as np
@@ -59,10 +60,10 @@ class JointMap:
             q_from += [q + k for k in order]
             q_to += [joint.idx_q + k for k in range(len(order))]
             v_from += [v + k for k in range(joint.nv)]
-        self._q, self._R = robot.home.copy(), np.eye(3)
+        self._q, self._R, self._base = robot.home.copy(), np.eye(3), _places(v_from[:3])
         self.nv = nv
         """Number of velocity coordinates of the other program."""
-        self._q_from, self._q_to, self._v_from = (np.array(x, dtype=np.intp) for x in (q_from, q_to, v_from))
+        self._q_from, self._q_to, self._v_from = map(_places, (q_from, q_to, v_from))
 
     @classmethod
     def of_pinocchio(cls, robot: Robot, model: Any) -> JointMap:
@@ -99,7 +100,7 @@ class JointMap:
 
     def v(self, values: Any) -> Array:
         """Return the robot's velocity (nv,); of a floating base, at the configuration that `q` was given last."""
-        v: Array = np.asarray(values, dtype=np.float64)[self._v_from]
+        v: Array = np.array(np.asarray(values, dtype=np.float64)[self._v_from])
         if self._has_base:
             v[:3] = self._R.T @ v[:3]
         return v
@@ -109,10 +110,12 @@ class JointMap:
 
         Joints that are not the robot's rest where their velocity is NaN or infinite.
         """
-        out = np.nan_to_num(np.array(values, dtype=np.float64), nan=0.0, posinf=0.0, neginf=0.0)
+        out = np.array(values, dtype=np.float64)
+        if not isfinite(out.sum()):
+            out[~np.isfinite(out)] = 0.0
         out[self._v_from] = v
         if self._has_base:
-            out[self._v_from[:3]] = self._R @ v[:3]
+            out[self._base] = self._R @ v[:3]
         return out
 
     def write_columns(self, J: Array, out: Array) -> None:
@@ -120,4 +123,11 @@ class JointMap:
         out[:] = 0.0
         out[:, self._v_from] = J
         if self._has_base:
-            out[:, self._v_from[:3]] = J[:, :3] @ self._R.T
+            out[:, self._base] = J[:, :3] @ self._R.T
+
+
+def _places(indices: list[int]) -> Any:
+    """Return what indexes these places of an array: a slice where they follow each other, which is faster."""
+    first = indices[0] if indices else 0
+    is_run = indices == list(range(first, first + len(indices)))
+    return slice(first, first + len(indices)) if is_run else np.array(indices, dtype=np.intp)

@@ -36,8 +36,8 @@ class RowLimit:
 
     def __init__(self, controller: Controller, joints: JointMap) -> None:
         self.controller, self.joints = controller, joints
-        signs = np.eye(controller.scene.robot.model.nv)
-        self._signs = np.concatenate((signs, -signs))
+        one = np.eye(controller.scene.robot.model.nv)
+        self._signs = np.concatenate((one, -one))
         self.obstacles: Mapping[str, Any] | None = None
         """Where obstacles are now, for the next step; see `Controller.step`."""
         self.t: float | None = None
@@ -53,16 +53,18 @@ class RowLimit:
         """
         if abs(dt - self.controller.dt) > 1e-9:
             raise ConfigError(f"dt: {dt} s, but the controller has {self.controller.dt} s")
-        problem: Problem = self.controller.rows(self.joints.q(q), self.t, self.obstacles)
-        self.obstacles, rows, sides = None, problem.avoidance, len(self._signs)
-        G, h = np.empty((sides + len(rows.b), self.joints.nv)), np.empty(sides + len(rows.b))
-        self.joints.write_columns(self._signs, G[:sides])
-        self.joints.write_columns(rows.J, G[sides:])
-        np.negative(G[sides:], out=G[sides:])
-        h[: sides // 2], h[sides // 2 : sides], h[sides:] = problem.upper, problem.lower, rows.b
-        np.negative(h[sides // 2 :], out=h[sides // 2 :])
+        problem = self.controller.rows(self.joints.q(q), self.t, self.obstacles)
+        self.obstacles = None
+        return self.as_inequalities(problem)
+
+    def as_inequalities(self, problem: Problem) -> tuple[Array, Array]:
+        """Return rows and bounds of a control step as G (m, nv) and h (m,) of G Δq <= h."""
+        rows, sides = problem.avoidance, len(self._signs)
+        G = np.empty((sides + len(rows.b), self.joints.nv))
+        self.joints.write_columns(np.concatenate((self._signs, -rows.J)), G)
+        h = np.concatenate((problem.upper, -problem.lower, -rows.b))
         np.minimum(h, _NO_BOUND, out=h)
-        h *= dt
+        h *= self.controller.dt
         return G, h
 
     def command(self, v: Any) -> Array:

@@ -8,6 +8,7 @@ from qpavoid.config.base import Block
 from qpavoid.config.control import (
     Avoidance,
     Beta,
+    Dynamics,
     FastFinish,
     Limits,
     Planning,
@@ -16,6 +17,8 @@ from qpavoid.config.control import (
     TaskSwitching,
 )
 from qpavoid.config.motion import Circle, Csv, Fixed, Line, Motion, Waypoints
+from qpavoid.config.observer import Observer
+from qpavoid.config.plant import Payload, PlantSettings, Push
 from qpavoid.config.robot import Body, Hull, JointLimits, PairMargin, Polytope, RobotConfig
 from qpavoid.config.scenario import ObstacleConfig, ScenarioConfig
 from qpavoid.config.shapes import (
@@ -58,10 +61,10 @@ from qpavoid.config.tasks import (
 
 __all__ = [
     "AlignTask", "AnyTask", "Avoidance", "Beta", "Block", "Body", "Box", "Capsule", "Circle", "ComTask", "Cone",
-    "Contact", "Csv", "Cylinder", "DampingTask", "Ellipsoid", "Eq10Solver", "FastFinish", "Fixed",
+    "Contact", "Csv", "Cylinder", "DampingTask", "Dynamics", "Ellipsoid", "Eq10Solver", "FastFinish", "Fixed",
     "GradientProjectionSolver", "HalfSpace", "HqpSolver", "Hull", "JointLimits", "Limits", "Line", "LookAtTask",
-    "ManipulabilityTask", "Mesh", "Motion", "ObstacleConfig", "ObstacleShape", "PairMargin", "Planning", "PointCloud",
-    "Polytope", "PostureTask", "PotentialFieldSolver", "Progress", "QpSolver", "RelativeTask", "RobotConfig",
-    "ScenarioConfig", "Sensing", "Shape", "SolverConfig", "Sphere", "StepSearchSolver", "Task", "TaskBlock",
-    "TaskSwitching", "TrackingSolver", "Waypoints", "expand_solver",
+    "ManipulabilityTask", "Mesh", "Motion", "Observer", "ObstacleConfig", "ObstacleShape", "PairMargin", "Payload",
+    "Planning", "PlantSettings", "PointCloud", "Polytope", "PostureTask", "PotentialFieldSolver", "Progress", "Push",
+    "QpSolver", "RelativeTask", "RobotConfig", "ScenarioConfig", "Sensing", "Shape", "SolverConfig", "Sphere",
+    "StepSearchSolver", "Task", "TaskBlock", "TaskSwitching", "TrackingSolver", "Waypoints", "expand_solver",
 ]  # fmt: skip

@@ -7,6 +7,9 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, model_validator
 
 from qpavoid.config.base import Block, NonNegative, Positive
+from qpavoid.config.observer import Observer
+
+Fraction = Annotated[float, Field(gt=0, le=1)]
 
 
 class Beta(Block):
@@ -89,6 +92,38 @@ class Limits(Block):
     """Whether the QP passes acceleration and jerk limits before it lets a pair come too near; false: it never does."""
     saturate: bool = True
     """Whether the solvers that know no limits (all but the QP) are scaled and clipped to them afterwards."""
+
+
+class Dynamics(Block):
+    """Torque level: v is the velocity at the end of the control period, and torques within their limits lead to it."""
+
+    torque_limits: Fraction | None = 1.0
+    """Share of the torque limits that may be used [-]; `null`: torques have no limits, and braking counts on the
+    accelerations as they are."""
+    braking_fraction: Fraction = 0.75
+    """Share of these torques on which braking counts [-]: what is left covers errors of the model, and that dynamics
+    change during a stop."""
+    holding_fraction: Fraction | None = 0.6
+    """Share of these torques that gravity may take [-], below `braking_fraction`; `null`: rows do not keep to it."""
+    tracking_rate: Positive = 100.0
+    """k_v [1/s]: the rate at which the measured velocity approaches the one that the tasks ask for. A task of gain K
+    then has the stiffness K k_v and the damping k_v."""
+    row_rate: Positive = 100.0
+    """α2 [1/s]: the rate at which rows are approached, at least four times the gain of the avoidance rows."""
+    observer: Observer | None = None
+    """What touches the robot, see `Solution.external`; left out, or `null`: it is not observed."""
+    armature: NonNegative | dict[str, NonNegative] = {}
+    """Inertia of rotor and gear, of all joints or by joint name [kg m² or kg]; what is left out is that of the robot's
+    file."""
+
+    @model_validator(mode="after")
+    def _ordered(self) -> Dynamics:
+        if self.holding_fraction is not None and self.holding_fraction >= self.braking_fraction:
+            raise ValueError(
+                f"holding_fraction = {self.holding_fraction:g} must be below braking_fraction = "
+                f"{self.braking_fraction:g}, else no torque is left to brake with"
+            )
+        return self
 
 
 class Sensing(Block):

@@ -50,13 +50,15 @@ class JointLimits(Block):
     """Limits that replace those of the URDF, by joint name."""
 
     position: dict[str, tuple[Number, Number]] = {}
-    """Joint: [lower, upper] [rad or m]."""
+    """Joint: from lower to upper [rad or m]."""
     velocity: dict[str, Positive | list[Positive]] = {}
     """Joint: largest speed [rad/s or m/s]; a list for a joint of several coordinates, such as `root_joint`."""
     acceleration: dict[str, Positive] = {}
     """Joint: largest acceleration [rad/s² or m/s²]; a URDF has no field for it."""
     jerk: dict[str, Positive] = {}
     """Joint: largest jerk [rad/s³ or m/s³]; needs an acceleration limit of the same joint."""
+    torque: dict[str, Positive] = {}
+    """Joint: largest torque or force [Nm or N], for scenarios with `dynamics`."""
 
     @model_validator(mode="after")
     def _ordered(self) -> JointLimits:

@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 from pydantic import Field, PrivateAttr, model_validator
 
 from qpavoid.config.base import Block, NonNegative, Number, Positive
-from qpavoid.config.control import Avoidance, Limits, Planning, Progress, Sensing
+from qpavoid.config.control import Avoidance, Dynamics, Limits, Planning, Progress, Sensing
 from qpavoid.config.motion import Circle, Fixed, Line, Motion
 from qpavoid.config.shapes import HalfSpace, Mesh, ObstacleShape, PointCloud
 from qpavoid.config.solver import QpSolver, SolverConfig
@@ -78,6 +78,8 @@ class ScenarioConfig(Block):
     limits: Limits = Limits()
     sensing: Sensing = Sensing()
     progress: Progress = Progress()
+    dynamics: Dynamics | None = None
+    """Torque level; left out, or `null`: what is commanded is a velocity."""
     planning: Planning | None = None
     """Forecasts and plans; left out, or `null`: none."""
     solver: SolverConfig = QpSolver()

@@ -164,3 +164,14 @@ class Contact(Block):
     """`surface`: neither slides nor turns, 6 rows; `point`: may turn, 3 rows."""
     gain: NonNegative = 10.0
     """Feedback on what it has slid all the same [1/s]."""
+    vertices: list[Vec3] = []
+    """With `dynamics`: corners of a surface in the frame, where forces act [m]; of a point, its place, at first the
+    frame's origin."""
+    normal: Vec3 = (0.0, 0.0, 1.0)
+    """With `dynamics`: direction in the frame in which the ground pushes [-]."""
+    friction: Positive = 0.5
+    """With `dynamics`: friction coefficient μ on which forces count [-]."""
+    force: tuple[NonNegative, Positive] = (2.0, 1000.0)
+    """With `dynamics`: least and largest normal force of each corner [N]."""
+    rate: Positive = 60.0
+    """With `dynamics`: rate at which a frame that moves is brought to rest [1/s]."""

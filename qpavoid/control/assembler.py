@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from qpavoid import kernels
+from qpavoid.budget import UNLIMITED
 from qpavoid.control.contacts import ContactRows
 from qpavoid.control.distances import DistanceQuery
 from qpavoid.control.jerk_stops import JerkStop, JerkStops
@@ -16,15 +17,12 @@ from qpavoid.control.row_layout import lay_out
 from qpavoid.control.settings import ControlSettings
 from qpavoid.control.tasks import RowTask, in_order
 from qpavoid.control.tasks.layout import TaskRows, dead_beat, task_levels
+from qpavoid.control.tracked import TrackedVelocities
 from qpavoid.kernels import SETTLED, TO_MEASURE
 from qpavoid.kernels.layout import RowLayout
 from qpavoid.model.kinematics import ForwardKinematics, Kinematics
-from qpavoid.problem import Array, AvoidanceRows, Contacts, IntArray, Problem, Proximity, Tracking
-from qpavoid.solvers.hqp import cascade
+from qpavoid.problem import Array, AvoidanceRows, Contacts, Problem, Proximity, Solution, Tracking
 from qpavoid.solvers.solver import Solver
-
-_LACKING = 1e-6
-"""Share of a task's velocity up to which it lacks nothing [-]: round-off of the tracking law."""
 
 
 class _Form(NamedTuple):
@@ -38,7 +36,7 @@ class _Form(NamedTuple):
     """What there is of k near pairs, by k."""
 
 
-class RowAssembler:
+class RowAssembler(TrackedVelocities):
     """Rows and bounds of a control step. What it returns looks into memory that the next step overwrites."""
 
     def __init__(
@@ -62,13 +60,19 @@ class RowAssembler:
         """Surface distance below which a pair gets a row [m]."""
         self.query.set_influence_distance(self.influence_distance)
         x = self._layout = lay_out(settings, frames, row_tasks, self._forward, self.query)
-        self._hard = (x.hard_lower, x.hard_upper) if limits.relax_acceleration else (x.lower, x.upper)
+        is_hard = limits.relax_acceleration or settings.dynamics is not None
+        self._hard = (x.hard_lower, x.hard_upper) if is_hard else (x.lower, x.upper)
         self._packed: Any = kernels.pack(x)
-        self._contacts = contacts
+        self.dynamics = settings.dynamics
+        own = None if self.dynamics is None else self.dynamics.contacts
+        self.contacts = self._contacts = own or (None if contacts is None else contacts.own_copy())
+        """Frames that rest, and which of them do now; None without any."""
+        if self.dynamics is not None:
+            self.dynamics.lay_out(x)
         self._scene = scene
         self.joint_names, self.joint_units = tuple(scene.robot.coordinate_names), tuple(scene.robot.coordinate_units)
         """Name and unit of each coordinate."""
-        self.previous = PreviousVelocity(x, contacts is not None)
+        self.previous = PreviousVelocity(x, contacts is not None and self.dynamics is None)
         """Velocity at which the robot moves when a step begins."""
         self._stops = JerkStops(x, self._packed) if x.jerk_limited else None
         self.targets = x.targets
@@ -110,6 +114,10 @@ class RowAssembler:
         """
         looks_ahead = looks_ahead and law.bounded and self._contacts is None and not self._layout.jerk_limited
         numbers: dict[str, Any] = {"looks_ahead": looks_ahead, "regularization": law.compiled_regularization}
+        if self.dynamics is not None:
+            if not self.dynamics.has_torques:  # without torque limits, margins are relaxed before accelerations
+                numbers["regularization"] = 0.0
+            self.dynamics.approaches[0] = self._approaches = law.bounded
         if numbers != {name: getattr(self._layout, name) for name in numbers}:
             self._forms = [self._make_form(form.layout._replace(**numbers)) for form in self._forms]
             self.use_form(0)
@@ -135,11 +143,14 @@ class RowAssembler:
     def use_form(self, number: int) -> None:
         """Choose the form of the rows of the next steps; 0 is that of the settings."""
         self._layout, self._packed, self._step, self._views = self._forms[number]
+        self._row_count = self._layout.summary.view(np.ndarray)["rows"]
 
     def _make_form(self, layout: RowLayout) -> _Form:
         """Pack a layout."""
         packed = kernels.pack(layout)
         arguments = packed, self.q, self.influence_distance, False, True, False
+        if self.dynamics is not None:
+            return _Form(layout, packed, self.dynamics.step(*arguments), {})
         return _Form(layout, packed, kernels.direct(kernels.control_step, *arguments), {})
 
     def compute(self, q: Array, targets: Sequence[Any], v_desired: Array | None = None) -> bool:
@@ -157,6 +168,8 @@ class RowAssembler:
         self.q[:] = q  # the code takes q as it is: in one piece, and writeable
         if v_desired is not None:
             x.v_tracking[:] = v_desired
+        if self.dynamics is not None:
+            self.dynamics.update(self.q, x.v_prev)
         if self._is_compiled:
             moving = self.query.is_moving
             code = self._step(self._packed, self.q, self.influence_distance, moving, from_tasks, False)
@@ -168,14 +181,25 @@ class RowAssembler:
         if from_tasks and self.task_errors.size:
             self._task_rows.write(q, self._forward, targets[len(self.targets) :])
         if self._contacts is not None:
-            self._contact_rows = resting = self._contacts.update(self._forward)
-            x.v_prev[:] = resting.project(x.v_prev)
+            self._contacts.advance(x.dt, self._forward)
+            if self.dynamics is not None:  # from the velocity as measured
+                self._contact_rows = self.dynamics.stand(self._forward, x.v_prev)
+            else:
+                self._contact_rows = resting = self._contacts.update(self._forward)
+                x.v_prev[:] = resting.project(x.v_prev)
         return self._finish()
 
-    def follow(self, v_desired: Array) -> bool:
-        """Follow a velocity (nv,) in place of the tasks in the last step after all; return what `compute` does."""
+    def follow(self, v_desired: Array, at_once: bool = False) -> bool:
+        """Follow a velocity (nv,) in place of the tasks in the last step after all; return what `compute` does.
+
+        With `at_once`, a torque level takes it as that of the end of the control period, and does not approach it.
+        """
         self._follows_tasks, self._layout.v_tracking[:] = False, v_desired
-        return self._finish()
+        if self.dynamics is None or not at_once:
+            return self._finish()
+        self.dynamics.approaches[0] = False
+        is_settled, self.dynamics.approaches[0] = self._finish(), self._approaches
+        return is_settled
 
     def _finish(self) -> bool:
         """Compute a step whose kinematics and distances are up to date."""
@@ -210,7 +234,8 @@ class RowAssembler:
         return Problem(
             tracking, self._view()[1], x.lower, x.upper, *self._hard, x.v_stop, self._scene.pair_names,
             self.joint_names, self.joint_units, x.v_tracking, violation, self._contact_rows, levels, None, bent,
-            x.jerk_limited, is_clear, position_margin,
+            x.jerk_limited, is_clear, position_margin, UNLIMITED,
+            None if self.dynamics is None else self.dynamics.rows(x.v_prev),
         )  # fmt: skip
 
     def _hold(self, contacts: Contacts) -> None:
@@ -220,10 +245,15 @@ class RowAssembler:
             summary.bent = self._track_within(contacts)
         else:
             x.v_tracking[:] = contacts.project(x.v_tracking)
-        self.previous.tighten_bounds()
+        if self.dynamics is None:
+            self.previous.tighten_bounds()
+        elif self.dynamics.approaches[0]:
+            x.v_tracking[:] = self.dynamics.approach(x.v_tracking, x.v_prev)
         if x.task_switching:
             summary.bent = 0.0
             kernels.row_bounds(self._packed, summary.rows, self.query.is_moving)
+            if self.dynamics is not None:
+                kernels.slow_rows(self._packed, self.dynamics.packed, summary.rows)
         summary.violation = kernels.tracking_violation(self._packed, summary.rows)
 
     def _track_within(self, contacts: Contacts) -> float:
@@ -236,71 +266,10 @@ class RowAssembler:
         x.b_feasible[:] += x.A @ v_particular
         return bent
 
-    def _velocity(self, A: Array, b: Array) -> Array:
-        """Return the velocity (nv,) of the tracking law for rows A (r, nv) and b (r,), zero but for some tasks."""
-        x, feedback = self._layout, self._layout.feedback.copy()
-        x.feedback[~A[: len(feedback)].any(axis=1)] = 0.0
-        v = np.empty(A.shape[1])
-        kernels.tracking_law(self._packed, A, b, v, self._b_feasible)
-        x.feedback[:] = feedback
-        return v
-
-    def _bending(self, rows: IntArray, v: Array) -> Array:
-        """Return -dt G(r) / ‖A‖² (nv, nv): what motion costs the task rows at second order, with r what v lacks."""
-        x, frames = self._layout, rows[rows < len(self.frame_errors)]
-        lacking, asked = np.zeros_like(self.frame_errors), self._b_feasible[frames]
-        lacking[frames] = self.row_scale[frames] * (asked - x.A[frames] @ v)
-        if not np.linalg.norm(lacking) > _LACKING * np.linalg.norm(asked):
-            return np.zeros_like(self._layout.identity)
-        return -x.dt / float(np.linalg.norm(x.A[rows], 2)) ** 2 * self.curvature(lacking)
-
-    def curvature(self, w: Array) -> Array:
-        """Return Σ w_r ∂²x_r/∂q² (nv, nv) of the rows of all frames; see `kernels.add_curvature`."""
-        G = np.zeros_like(self._layout.identity)
-        for part in range(len(w) // 3):
-            kernels.add_curvature(self._packed, part, w[3 * part : 3 * part + 3], G)
-        return G
-
-    def within_jerks(self, problem: Problem) -> Problem:
-        """Return the problem of this step with a tracking velocity that jerks allow, see `JerkStops.reachable`."""
-        v_tracking = problem.v_tracking
-        if self._stops is None or v_tracking[0] != v_tracking[0]:
-            return problem
-        reachable = self._stops.reachable(v_tracking)
-        if problem.contacts is not None:
-            reachable = problem.contacts.project(reachable)
-        change = problem.tracking.A @ (reachable - v_tracking)
-        tracking = problem.tracking._replace(b=problem.tracking.b + change)
-        rows = self._tracking_rows(problem.avoidance, reachable)
-        violation = float(kernels.violation(reachable, rows.J, rows.b, problem.lower, problem.upper))
-        return problem._replace(tracking=tracking, avoidance=rows, v_tracking=reachable, violation=violation)
-
-    def prioritised(self, problem: Problem) -> Problem:
-        """Return the problem of this step with the velocities of its priorities, and rows for the last one.
-
-        Args:
-            problem: of several levels, as `compute` gave it.
-        """
-        velocities = cascade(problem, self._velocity, self._bending)
-        v, rows = velocities[-1], self._tracking_rows(problem.avoidance, velocities[-1])
-        violation = float(kernels.violation(v, rows.J, rows.b, problem.lower, problem.upper))
-        return problem._replace(
-            avoidance=rows, v_tracking=v, violation=violation, cascade=velocities, tracking_is_clear=False
-        )
-
-    def _tracking_rows(self, rows: AvoidanceRows, v: Array) -> AvoidanceRows:
-        """Return the rows for another tracked velocity (nv,); the same ones if they do not depend on it."""
-        x, k = self._layout, len(rows.d)
-        if not (x.task_switching and k):
-            return rows
-        memory = x.v_tracking, x.rhs[:k], x.rhs_contact[:k]
-        saved = [array.copy() for array in memory]
-        x.v_tracking[:] = v
-        kernels.row_bounds(self._packed, k, self.query.is_moving)
-        rows = rows._replace(b=x.rhs[:k].copy(), b_contact=x.rhs_contact[:k].copy())
-        for array, values in zip(memory, saved, strict=True):
-            array[:] = values
-        return rows
+    def torques(self, solution: Solution) -> Solution:
+        """Return a solution with its torques, see `RobotDynamics.command`."""
+        assert self.dynamics is not None
+        return self.dynamics.command(solution, self._layout.v_prev, self.joint_names, self.joint_units)
 
     def stop(self, q: Array, v: Array) -> JerkStop | None:
         """Return the stop after a step at v (nv,) from q (nq,); None without jerk limits, where it is straight."""
@@ -334,7 +303,7 @@ class RowAssembler:
 
     def _view(self) -> tuple[Proximity, AvoidanceRows]:
         """Return what there is of the near pairs of the last step."""
-        x, k = self._layout, int(self._layout.summary["rows"][0])
+        x, k = self._layout, int(self._row_count[0])
         if k not in self._views:
             near = x.near_pairs[:k]
             proximity = Proximity(near, x.closest[:k], x.J[:k], x.feedforward[:k])

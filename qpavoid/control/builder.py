@@ -21,6 +21,7 @@ from qpavoid.control.settings import ControlSettings
 from qpavoid.control.slots import ObstacleSlots
 from qpavoid.control.targets import TargetReader
 from qpavoid.control.tasks import RowTask
+from qpavoid.errors import NumericalError
 from qpavoid.kernels.bounds import OUTSIDE
 from qpavoid.model.sample import POSE, Sample
 from qpavoid.problem import Array
@@ -76,6 +77,8 @@ class ProblemBuilder:
         """Check the arguments of a step, see `Controller.step`: whatever raises does so here, and changes nothing."""
         if self._budget.is_limited:
             self._budget.begin()
+        if self.rows.dynamics is not None and v is None:
+            raise NumericalError("v: with `dynamics`, a step needs the velocity (nv,) as measured: step(q, v=…)")
         return self._read(q, t, targets, obstacles, v, v_desired)
 
     def build(self, arguments: Arguments) -> StepProblem:
@@ -97,6 +100,8 @@ class ProblemBuilder:
             self._restart(np.zeros(self._model.nv) if v is None else v)
         elif times.periods > 1:
             self._under_way.add(rows.previous.v, times.periods - 1)
+        if rows.dynamics is not None and v is not None:
+            rows.previous.measure(v)
         if q is None or self._latency:
             q = self._predict(q)
         self._clock.set(times.t)
@@ -104,6 +109,9 @@ class ProblemBuilder:
             observed = self.tracker.advance(update)
             query.place(self.tracker.current)
             faults, assumptions = faults + observed.stop, assumptions + observed.assumptions
+        if rows.dynamics is not None and v is not None:
+            rows.dynamics.observe(q, v)
+            faults, assumptions = rows.dynamics.touched(faults, assumptions)
         is_settled = rows.compute(q, targets, v_desired)
         if self.attachments.is_watching:
             self.attachments.update()
@@ -182,6 +190,8 @@ class ProblemBuilder:
     def reset(self, v: Array) -> None:
         """Forget the steps before; the robot moves at v (nv,). Attached objects stay attached."""
         self._restart(v)
+        if (dynamics := self.rows.dynamics) is not None and dynamics.observer is not None:
+            dynamics.observer.reset()
         self.begun, self._thread = None, None
         self._clock.reset()
         self._targets.last = ()

@@ -7,47 +7,122 @@ limits; hard joint limits are kept as well, and where those leave no velocity th
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
+from copy import copy
 from pathlib import Path
 
 import numpy as np
 
-from qpavoid import config
+from qpavoid import config, kernels
 from qpavoid.control.tasks.base import frame_pose
-from qpavoid.errors import ConfigError
+from qpavoid.errors import ConfigError, require_known
 from qpavoid.kernels.rotation import rotation_vector
 from qpavoid.model.kinematics import ForwardKinematics
 from qpavoid.model.robot import Robot
-from qpavoid.problem import Array, Contacts
+from qpavoid.problem import Array, Contacts, IntArray
+from qpavoid.reason import Reason, ReasonKind
 
+_NO_BACKUP = Reason.of(
+    ReasonKind.NO_BACKUP, "contacts", detail="backup trajectories do not hold contacts: avoidance.backup"
+)
+"""Assumption where obstacles move and the robot stands on something."""
 _CORRECTION = 0.02
 """Largest speed at which what has slid is put right [m/s, rad/s]."""
-_DEPENDENT = 1e-8
-"""Share of the largest pivot below which a row follows from the others, as with two hands on one wall [-]."""
+
+
+def within_contacts(
+    avoidance: config.Avoidance, has_contacts: bool, has_torques: bool
+) -> tuple[config.Avoidance, tuple[Reason, ...]]:
+    """Return the block as far as it goes with contacts, and what to assume where obstacles move.
+
+    Backup trajectories do not hold contacts. At the torque level, the stop that the look-ahead counts on is one of
+    accelerations that all joints could have at once whatever the rest does: a tenth of those that one has.
+    """
+    if not has_contacts:
+        return avoidance, ()
+    reasons = (_NO_BACKUP,) if avoidance.backup else ()
+    look_ahead = avoidance.look_ahead and not has_torques
+    return avoidance.model_copy(update={"backup": False, "look_ahead": look_ahead}), reasons
 
 
 class ContactRows:
-    """The contacts of a robot, and where they rest."""
+    """The contacts of a robot, where they rest, and which of them do now."""
 
     def __init__(
         self, settings: Sequence[config.Contact], frame_ids: Sequence[int], kinematics: ForwardKinematics
     ) -> None:
         """Let the frames rest where the kinematics have them; see `build_contacts`."""
-        self.frame_ids = tuple(frame_ids)
+        self.settings, self.frame_ids = tuple(settings), tuple(frame_ids)
         self._anchors = [tuple(part.copy() for part in frame_pose(kinematics, i)) for i in frame_ids]
-        self._gains = np.repeat([contact.gain for contact in settings], 6)
-        self._rows = np.repeat([(True, contact.type == "surface") for contact in settings], 3)
+        self._gains = np.repeat([contact.gain for contact in settings], 6).reshape(-1, 6)
+        self._rows = np.repeat([(True, contact.type == "surface") for contact in settings], 3, axis=1)
+        self.shares = np.ones(len(frame_ids))
+        """How far each bears what it may [-]: 1 at rest on the ground, 0 off it, between where it comes or leaves."""
+        self._rates = np.zeros(len(frame_ids))
+        self._comes = np.zeros(len(frame_ids), dtype=bool)
+        self.jacobians = np.zeros((len(frame_ids), 6, 0))
+
+    def own_copy(self) -> ContactRows:
+        """Return the same contacts, which come and leave by themselves."""
+        own = copy(self)
+        own.take_over(self)
+        return own
+
+    def take_over(self, other: ContactRows) -> None:
+        """Let contacts rest, come and leave as other ones of the same frames do."""
+        self._anchors, self.shares = list(other._anchors), other.shares.copy()
+        self._rates, self._comes = other._rates.copy(), other._comes.copy()
+
+    @property
+    def active(self) -> IntArray:
+        """Return which contacts hold their frames, by number."""
+        return np.flatnonzero((self.shares > 0.0) | self._comes)
+
+    def switch(self, names: Collection[str], duration: float) -> None:
+        """Let the contacts of some frames come or stay, and all others leave, over a duration [s].
+
+        Raises:
+            UnknownName: of a frame without a contact.
+        """
+        frames = [contact.frame for contact in self.settings]
+        for name in names:
+            require_known(name, frames, "set_contacts: no contact of")
+        for i, frame in enumerate(frames):
+            aim = float(frame in names)
+            self._comes[i] |= bool(aim and self.shares[i] == 0.0)
+            self._rates[i] = np.sign(aim - self.shares[i]) / max(duration, 1e-9)
+
+    def advance(self, dt: float, kinematics: ForwardKinematics) -> None:
+        """Go on by a control period dt [s]; a frame that comes rests where the kinematics have it."""
+        for i in np.flatnonzero(self._comes):
+            self._anchors[i] = tuple(part.copy() for part in frame_pose(kinematics, self.frame_ids[i]))
+        self._comes[:] = False
+        np.clip(self.shares + dt * self._rates, 0.0, 1.0, out=self.shares)
 
     def update(self, kinematics: ForwardKinematics) -> Contacts:
         """Their rows at the configuration for which the kinematics are up to date, solved."""
-        J = np.concatenate([kinematics.frame_jacobian(i) for i in self.frame_ids])
-        missing = []
-        for frame_id, (position, rotation) in zip(self.frame_ids, self._anchors, strict=True):
-            x, R = frame_pose(kinematics, frame_id)
-            missing += [*(position - x), *rotation_vector((rotation @ R.T).tolist())]
-        b = (self._gains * missing)[self._rows]
-        b *= min(1.0, _CORRECTION / max(float(np.abs(b).max()), 1e-12))
-        return solve_contacts(J[self._rows], b)
+        return solve_contacts(*self.rows(kinematics))
+
+    def rows(self, kinematics: ForwardKinematics) -> tuple[Array, Array]:
+        """Return the rows J (c, nv) and b (c,) of the active contacts: J v = b brings them to where they rest.
+
+        The Jacobians (f, 6, nv) of all contact frames, zero of those that are not active, are `jacobians` afterwards.
+        """
+        active, b = self.active.tolist(), np.zeros((len(self.settings), 6))
+        self.jacobians = np.zeros((len(self.settings), 6, kinematics.frame_jacobian(self.frame_ids[0]).shape[1]))
+        for i in active:
+            (position, rotation), (x, R) = self._anchors[i], frame_pose(kinematics, self.frame_ids[i])
+            b[i] = self._gains[i] * [*(position - x), *rotation_vector((rotation @ R.T).tolist())]
+            self.jacobians[i] = kinematics.frame_jacobian(self.frame_ids[i])
+        rows, missing = self._rows[active], b[active]
+        missing = missing[rows]
+        missing *= min(1.0, _CORRECTION / max(float(np.abs(missing).max(initial=0.0)), 1e-12))
+        return self.jacobians[active][rows], missing
+
+    def row_owners(self) -> IntArray:
+        """Return the contact of each of these rows, by number (c,)."""
+        active = self.active
+        return np.repeat(active, self._rows[active].sum(axis=1))
 
 
 def build_contacts(
@@ -77,23 +152,10 @@ def build_contacts(
 
 
 def solve_contacts(J: Array, b: Array) -> Contacts:
-    """Solve J v = b by a QR factorisation of Jᵀ with pivoting; rows that follow from others are left out.
+    """Solve J v = b; rows that follow from others are left out.
 
     Args:
         J: (c, nv) contact Jacobian.
         b: (c,) what has to be put right [m/s, rad/s].
     """
-    from scipy.linalg.lapack import dgeqp3, dorgqr, dtrtrs  # scipy is slow to import, and few robots have contacts
-
-    c, nv = J.shape
-    packed, order, tau, _, _ = dgeqp3(J.T)
-    pivots = np.abs(packed.diagonal())
-    rank = int((pivots > _DEPENDENT * pivots[0]).sum())
-    Q = np.zeros((nv, nv), order="F")
-    Q[:, : min(c, nv)] = packed[:, :nv]
-    Q, _, _ = dorgqr(Q, tau)
-    v_particular = np.zeros(nv)
-    if b.any():
-        y, _ = dtrtrs(packed[:rank, :rank], b[order[:rank] - 1], trans=1)
-        v_particular = Q[:, :rank] @ y
-    return Contacts(np.ascontiguousarray(Q[:, rank:]), v_particular, J, b)
+    return Contacts(*kernels.solve_rows(J, b), J, b)

@@ -40,6 +40,11 @@ class PreviousVelocity:
             np.clip(self._change, -self._x.v_step, self._x.v_step, out=self._x.dv_prev)
         self._x.v_prev[:] = v
 
+    def measure(self, v: Array) -> None:
+        """Take v (nv,) as measured: what is commanded next counts from it, jerks from the change commanded last."""
+        self._x.v_prev[:] = v
+        self._commanded[:] = v
+
     def restart(self, v: Array) -> None:
         """Take v (nv,) as the velocity at which the robot has been moving, without any acceleration."""
         self._x.v_prev[:], self._x.dv_prev[:] = v, 0.0

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
 from qpavoid.control.builder import ProblemBuilder
 from qpavoid.control.distances import DistanceQuery
+from qpavoid.control.observer import MomentumObserver
 from qpavoid.control.obstacle_states import ObstacleStates
-from qpavoid.errors import UnknownName, nearest
+from qpavoid.errors import ConfigError, UnknownName, nearest
 from qpavoid.model.sample import Sample
 from qpavoid.model.scene import Obstacle, Scene
 from qpavoid.problem import Array
@@ -20,6 +21,7 @@ class SceneChanges:
     scene: Scene
     """Robot and obstacles, those that were added among them."""
     _builder: ProblemBuilder
+    _planning: Any
 
     def _scene_changed(self, method: str, *arguments: Any) -> None:
         """Take note of a change that one of the methods below has made."""
@@ -142,6 +144,31 @@ class SceneChanges:
         """States of all obstacles in the last step; the next one overwrites them."""
         return self._builder.tracker.current
 
+    @property
+    def observer(self) -> MomentumObserver | None:
+        """What observes torques from outside; None unless `dynamics.observer` asks for it."""
+        dynamics = self._builder.rows.dynamics
+        return None if dynamics is None else dynamics.observer
+
+    def set_contacts(self, frames: Collection[str], duration: float = 0.1) -> None:
+        """Let the contacts of some frames come or stay, and all others leave.
+
+        A contact that leaves bears less and less, and is free after the duration; one that comes rests where its frame
+        is in the next step, and bears more and more. At velocity level, it holds its frame until the duration is over.
+
+        Args:
+            frames: those of the scenario's `contacts` that rest from now on.
+            duration: time in which the load is taken over [s].
+
+        Raises:
+            UnknownName: of a frame without a contact.
+            ConfigError: the controller has no contacts, or plans.
+        """
+        contacts = self._builder.rows.contacts
+        if contacts is None or self._planning is not None:
+            raise ConfigError("set_contacts: the controller was made without `contacts`, or with `planning`")
+        contacts.switch(frames, duration)
+
     def take_over(self, other: SceneChanges) -> None:
         """Add, attach and allow what another controller of the same scene has; see `clone`."""
         self._builder.slots.take_over(other.scene)
@@ -150,6 +177,8 @@ class SceneChanges:
             frame_id = model.getFrameId(model.names[joint])
             self._builder.attach(other._builder.tracker.index(name), frame_id, home, other.obstacle_pose(name, home))
         self._builder.attachments.take_over(other._builder.attachments)
+        if (contacts := self._builder.rows.contacts) is not None and (own := other._builder.rows.contacts) is not None:
+            contacts.take_over(own)
         self._scene_changed("take_over", other)
 
     def distances(self) -> DistanceQuery:

@@ -6,6 +6,8 @@ from dataclasses import dataclass, field
 
 from qpavoid.budget import UNLIMITED, Budget
 from qpavoid.config import Avoidance, Limits, Progress, Sensing
+from qpavoid.control.dynamics import RobotDynamics
+from qpavoid.errors import ConfigError
 from qpavoid.model.limits import JointBounds
 from qpavoid.model.scene import Scene
 
@@ -27,6 +29,8 @@ class ControlSettings:
     sensing: Sensing = field(default_factory=Sensing)
     progress: Progress = field(default_factory=Progress)
     budget: Budget = UNLIMITED
+    dynamics: RobotDynamics | None = None
+    """Dynamics of the robot; None at velocity level."""
 
     @property
     def safety_distance(self) -> float:
@@ -37,3 +41,18 @@ class ControlSettings:
     def influence_distance(self) -> float:
         """Between surfaces, below which a pair gets a row [m]."""
         return float(self.avoidance.d2 - self.avoidance.offset)
+
+
+def make_budget(seconds: float | Budget | None) -> Budget:
+    """Return a budget [s] of control steps; a given one as it is, and for None one without a limit.
+
+    Raises:
+        ConfigError: it is not positive.
+    """
+    if isinstance(seconds, Budget):
+        return seconds
+    if seconds is None:
+        return UNLIMITED
+    if not seconds > 0.0:
+        raise ConfigError(f"budget: {seconds} s, expected more than 0; it is in seconds")
+    return Budget(seconds)

@@ -74,5 +74,5 @@ class SplitStep:
             raise ConfigError("command: no step has begun; call `rows` before it")
         if faults := check_velocity("v_desired", v_desired, LARGEST_COMMAND):
             v_desired = np.zeros(nv)
-        step.is_settled, step.faults = self._builder.rows.follow(v_desired), step.faults + faults
+        step.is_settled, step.faults = self._builder.rows.follow(v_desired, at_once=True), step.faults + faults
         return self._decide(step, begin, from_tasks=False)

@@ -4,7 +4,6 @@ from qpavoid.kernels.approach import ApproachArrays, comes_near, extend_paths, w
 from qpavoid.kernels.backup import (
     backup_rows,
     closes_below,
-    max_offset,
 )
 from qpavoid.kernels.bounds import velocity_bounds
 from qpavoid.kernels.braking_bounds import speed_to_stop
@@ -18,21 +17,38 @@ from qpavoid.kernels.clearance import (
     joint_speeds,
     leaves_position_limits,
 )
+from qpavoid.kernels.contact_forces import (
+    ROWS_PER_POINT,
+    cone_rows,
+    eliminate_base,
+    force_torque_rows,
+    point_jacobians,
+    standing_dynamics,
+)
 from qpavoid.kernels.depth import CellGrid, OwnBodies, fill_cells, mark_own_pixels, recall_cells
+from qpavoid.kernels.dynamics import (
+    DynamicsArrays,
+    dynamics_step,
+    forward_dynamics,
+    inverse_dynamics,
+    project_widened,
+    slow_rows,
+)
 from qpavoid.kernels.estimates import ObstacleArrays, are_fine, check_updates, observe
 from qpavoid.kernels.kinematics import KinematicsArrays, update_kinematics
 from qpavoid.kernels.layout import SUMMARY, RowLayout
 from qpavoid.kernels.margins import distances_of, least_margin
 from qpavoid.kernels.near_pairs import DistanceArrays, near_pairs, place_bodies, place_obstacles
 from qpavoid.kernels.obstacles import Pieces, check_states, sample_pieces
+from qpavoid.kernels.orthogonal import solve_rows
 from qpavoid.kernels.planning import PlanningArrays, pair_clearances
 from qpavoid.kernels.planning_goals import FrameTargets
 from qpavoid.kernels.planning_search import search
 from qpavoid.kernels.pose_fit import extrapolate_states
 from qpavoid.kernels.prediction import Prediction, predict, prediction_error_bound
 from qpavoid.kernels.qp import max_clearance_velocity, minimize, project, project_soft
-from qpavoid.kernels.ramps import RampLimits, follow_ramp
-from qpavoid.kernels.rollout import RolloutArrays, advance_rollout, begin_rollout, rollout_outcome
+from qpavoid.kernels.ramps import RampLimits, follow_ramp, velocity_towards
+from qpavoid.kernels.rollout import RolloutArrays, advance_rollout, begin_rollout, offset_of_start, rollout_outcome
 from qpavoid.kernels.rotation import rotation_vector
 from qpavoid.kernels.rows import alpha, beta, distance_rows, row_bounds
 from qpavoid.kernels.step import (
@@ -51,6 +67,7 @@ from qpavoid.kernels.tracking_law import tracking_law
 from qpavoid.kernels.voxels import select_voxels, voxels_within
 
 __all__ = [
+    "ROWS_PER_POINT",
     "SETTLED",
     "SUMMARY",
     "TOLERANCE",
@@ -58,6 +75,7 @@ __all__ = [
     "ApproachArrays",
     "CellGrid",
     "DistanceArrays",
+    "DynamicsArrays",
     "FrameTargets",
     "KinematicsArrays",
     "ObstacleArrays",
@@ -82,17 +100,23 @@ __all__ = [
     "clearance_lower_bound",
     "closes_below",
     "comes_near",
+    "cone_rows",
     "control_step",
     "direct",
     "distance_rows",
     "distances_of",
+    "dynamics_step",
+    "eliminate_base",
     "extend_paths",
     "extrapolate_states",
     "fill_cells",
     "find_near_pairs",
     "first_use",
     "follow_ramp",
+    "force_torque_rows",
+    "forward_dynamics",
     "frame_rows",
+    "inverse_dynamics",
     "is_clear",
     "jerk_limited_stop",
     "joint_speeds",
@@ -100,18 +124,20 @@ __all__ = [
     "leaves_position_limits",
     "mark_own_pixels",
     "max_clearance_velocity",
-    "max_offset",
     "minimize",
     "near_pairs",
     "observe",
+    "offset_of_start",
     "pack",
     "pair_clearances",
     "place_bodies",
     "place_obstacles",
+    "point_jacobians",
     "predict",
     "prediction_error_bound",
     "project",
     "project_soft",
+    "project_widened",
     "projection_cost",
     "recall_cells",
     "roll_out_stop",
@@ -121,13 +147,17 @@ __all__ = [
     "sample_pieces",
     "search",
     "select_voxels",
+    "slow_rows",
+    "solve_rows",
     "sorted_setxor",
     "speed_to_stop",
+    "standing_dynamics",
     "stop_velocity",
     "tracking_law",
     "tracking_violation",
     "update_kinematics",
     "velocity_bounds",
+    "velocity_towards",
     "violation",
     "voxels_within",
     "write_path_point",

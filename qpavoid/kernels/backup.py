@@ -14,7 +14,14 @@ from qpavoid.problem import Array, IntArray, Mask
 
 @compiled
 def backup_rows(
-    x: Any, q: Array, pairs: IntArray, influence_distance: float, moving: bool, enabled: Mask, touch: float
+    x: Any,
+    q: Array,
+    pairs: IntArray,
+    bounds: Array,
+    influence_distance: float,
+    moving: bool,
+    enabled: Mask,
+    touch: float,
 ) -> tuple[int, int, float, float]:
     """Write velocity bounds, and the rows of the enabled pairs that are near and not in contact, less their margins.
 
@@ -22,6 +29,7 @@ def backup_rows(
         x: see `velocity_bounds` and `distance_rows`.
         q: configuration (nq,).
         pairs: which pairs to consider (c,), increasing.
+        bounds: lower bound on the distance of each pair whose result is larger than that, infinite of others (m,) [m].
         influence_distance: distance below which a pair is near [m].
         moving: whether any obstacle moves.
         enabled: (m,) enabled pairs; those in contact are disabled.
@@ -35,13 +43,15 @@ def backup_rows(
     k = distance_rows(x, pairs, influence_distance, moving)
     n, touching, nearest, nearest_separable = 0, 0, influence_distance, influence_distance
     for i in range(k):
-        if not enabled[x.near_pairs[i]]:
+        pair = x.near_pairs[i]
+        if not enabled[pair]:
             continue
-        x.closest[i, 0] -= x.margin[x.twist_row[x.near_pairs[i]]]
-        distance, slack = x.closest[i, 0], x.distance_allowance[x.near_pairs[i]]
-        nearest = np.minimum(nearest, distance + slack)  # keeps NaN, unlike min
+        margin, slack = x.margin[x.twist_row[pair]], x.distance_allowance[pair]
+        distance = np.minimum(x.closest[i, 0], bounds[pair]) - margin  # keeps NaN, unlike min
+        x.closest[i, 0] -= margin
+        nearest = np.minimum(nearest, distance + slack)
         if not distance >= touch:
-            enabled[x.near_pairs[i]] = False
+            enabled[pair] = False
             touching += 1
             continue
         nearest_separable = min(nearest_separable, distance + slack)

@@ -61,27 +61,54 @@ def mark_own_pixels(depth: Array, lens: Array, bodies: OwnBodies, margin: float,
         own: out (h, w).
     """
     height, width = depth.shape
+    planes, per_x, per_y = _planes_in_camera(bodies), 1.0 / lens[0], 1.0 / lens[1]
     own[:] = False
     for b in range(len(bodies.core)):
-        pose, sphere = bodies.poses[b], bodies.sphere[b]
-        x = pose[0] * sphere[0] + pose[3] * sphere[1] + pose[6] * sphere[2] + pose[9]
-        y = pose[1] * sphere[0] + pose[4] * sphere[1] + pose[7] * sphere[2] + pose[10]
-        z = pose[2] * sphere[0] + pose[5] * sphere[1] + pose[8] * sphere[2] + pose[11]
-        size = sphere[3] + margin
+        x, y, z = _center(bodies.poses[b], bodies.sphere[b])
+        size = bodies.sphere[b, 3] + margin
         if z + size <= 0.0:
             continue
         left, right = _pixels_across(x, z, size, lens[0], lens[2], width)
         top, bottom = _pixels_across(y, z, size, lens[1], lens[3], height)
+        kx, ky, kz, known = 0.0, 0.0, 0.0, 0.0  # the last point whose distance was computed, and that minus the margin
         for v in range(top, bottom):
+            ray_y = (v - lens[3]) * per_y
             for u in range(left, right):
                 d = depth[v, u]
-                if not abs(d - z) <= size:  # NaN too
+                if own[v, u] or not abs(d - z) <= size:  # NaN too
                     continue
-                px, py = d * ((u - lens[2]) / lens[0]), d * ((v - lens[3]) / lens[1])
-                if (px - x) ** 2 + (py - y) ** 2 + (d - z) ** 2 <= size * size and _is_within(
-                    bodies, b, margin, px, py, d
-                ):
-                    own[v, u] = True
+                px, py = d * ((u - lens[2]) * per_x), d * ray_y
+                if (px - x) ** 2 + (py - y) ** 2 + (d - z) ** 2 > size * size:
+                    continue
+                if (px - kx) ** 2 + (py - ky) ** 2 + (d - kz) ** 2 >= known * known:
+                    kx, ky, kz, known = px, py, d, _distance(bodies, planes, b, px, py, d) - margin
+                own[v, u] = known <= 0.0  # no distance differs by more than how far two points are apart
+
+
+@inlined
+def _center(pose: Array, sphere: Array) -> tuple[float, float, float]:
+    """Return the centre of a body's bounding sphere, in the camera's axes."""
+    return (
+        pose[0] * sphere[0] + pose[3] * sphere[1] + pose[6] * sphere[2] + pose[9],
+        pose[1] * sphere[0] + pose[4] * sphere[1] + pose[7] * sphere[2] + pose[10],
+        pose[2] * sphere[0] + pose[5] * sphere[1] + pose[8] * sphere[2] + pose[11],
+    )
+
+
+@inlined
+def _planes_in_camera(bodies: OwnBodies) -> Array:
+    """Return the planes of all bodies in the camera's axes (4, p): normals, then offsets; in rows, as vectors need."""
+    planes = np.empty((4, len(bodies.planes)))
+    for b in range(len(bodies.core)):
+        pose = bodies.poses[b]
+        for i in range(bodies.span[b, 0], bodies.span[b, 1]):
+            normal = bodies.planes[i]
+            offset = normal[3]
+            for k in range(3):
+                planes[k, i] = pose[k] * normal[0] + pose[3 + k] * normal[1] + pose[6 + k] * normal[2]
+                offset -= planes[k, i] * pose[9 + k]
+            planes[3, i] = offset
+    return planes
 
 
 @inlined
@@ -97,22 +124,24 @@ def _pixels_across(x: float, z: float, size: float, focal: float, center: float,
 
 
 @inlined
-def _is_within(bodies: OwnBodies, b: int, margin: float, x: float, y: float, z: float) -> bool:
-    """Return whether a point in the camera's axes is within a margin of body b."""
-    pose = bodies.poses[b]
+def _distance(bodies: OwnBodies, planes: Array, b: int, x: float, y: float, z: float) -> float:
+    """Return the distance of a point from body b, or from the farthest of its planes (4, p); in the camera's axes [m].
+
+    It is not positive inside, and changes by at most as much as the point is moved.
+    """
+    first, end = bodies.span[b, 0], bodies.span[b, 1]
+    if first < end:
+        nx, ny, nz, offsets = planes[0, first:end], planes[1, first:end], planes[2, first:end], planes[3, first:end]
+        farthest = -np.inf
+        for i in range(len(offsets)):
+            farthest = max(farthest, nx[i] * x + ny[i] * y + nz[i] * z + offsets[i])
+        return farthest
+    pose, core = bodies.poses[b], bodies.core[b]
     x, y, z = x - pose[9], y - pose[10], z - pose[11]
-    bx = pose[0] * x + pose[1] * y + pose[2] * z
-    by = pose[3] * x + pose[4] * y + pose[5] * z
-    bz = pose[6] * x + pose[7] * y + pose[8] * z
-    for i in range(bodies.span[b, 0], bodies.span[b, 1]):
-        plane = bodies.planes[i]
-        if plane[0] * bx + plane[1] * by + plane[2] * bz + plane[3] > margin:
-            return False
-    if bodies.span[b, 0] < bodies.span[b, 1]:
-        return True
-    core = bodies.core[b]
-    bx, by, bz = max(abs(bx) - core[1], 0.0), max(abs(by) - core[2], 0.0), max(abs(bz) - core[3], 0.0)
-    return bx * bx + by * by + bz * bz <= (core[0] + margin) ** 2
+    bx = max(abs(pose[0] * x + pose[1] * y + pose[2] * z) - core[1], 0.0)
+    by = max(abs(pose[3] * x + pose[4] * y + pose[5] * z) - core[2], 0.0)
+    bz = max(abs(pose[6] * x + pose[7] * y + pose[8] * z) - core[3], 0.0)
+    return float(np.sqrt(bx * bx + by * by + bz * bz) - core[0])
 
 
 @compiled
@@ -198,7 +227,10 @@ def recall_cells(
         Number of cells; -1 where they do not fit.
     """
     height, width = depth.shape
-    slack = 0.5 * np.sqrt(3.0) * resolution
+    slack, planes = 0.5 * np.sqrt(3.0) * resolution, _planes_in_camera(bodies)
+    centers = np.empty((len(bodies.core), 3))
+    for b in range(len(centers)):
+        centers[b, 0], centers[b, 1], centers[b, 2] = _center(bodies.poses[b], bodies.sphere[b])
     for i in range(len(known)):
         dx, dy, dz = known[i, 0] - pose[9], known[i, 1] - pose[10], known[i, 2] - pose[11]
         x = pose[0] * dx + pose[1] * dy + pose[2] * dz
@@ -210,8 +242,10 @@ def recall_cells(
             if -0.5 <= u < width - 0.5 and -0.5 <= v < height - 0.5:
                 row, column = int(v + 0.5), int(u + 0.5)
                 is_dropped = depth[row, column] > (z + slack if own[row, column] else z - slack)
-        for b in range(len(bodies.core)):
-            is_dropped = is_dropped or _is_within(bodies, b, 0.0, x, y, z)
+        for b in range(len(centers)):
+            away = (x - centers[b, 0]) ** 2 + (y - centers[b, 1]) ** 2 + (z - centers[b, 2]) ** 2
+            if away <= bodies.sphere[b, 3] ** 2 and not is_dropped:
+                is_dropped = _distance(bodies, planes, b, x, y, z) <= 0.0
         if is_dropped:
             continue
         ix, iy = int(np.floor(known[i, 0] / resolution)), int(np.floor(known[i, 1] / resolution))

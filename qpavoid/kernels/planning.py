@@ -1,8 +1,8 @@
 """Clearance of configurations, and of straight motions between them: what a planner asks thousands of times.
 
 A motion is *clear* if no pair of bodies comes nearer than the distance that it needs. That is certain, not sampled: no
-distance changes faster along a motion than the travel of the two bodies' fastest points, which lever arms bound. A
-sample whose distances exceed what is needed covers a stretch of the motion on both sides of it. Each next sample is in
+distance changes by more than the travel of the two bodies' fastest points, which `planning_motion` bounds. A sample
+whose distances exceed what is needed covers a stretch of the motion on both sides of it. Each next sample is in
 the middle of a stretch that is not covered yet (conservative advancement, in both directions), and looks at a pair only
 where its bounding sphere, then its box, might come so near that the whole stretch is not covered.
 """
@@ -17,6 +17,7 @@ from qpavoid.kernels.distances import TO_HALF_SPACE, pair_distance
 from qpavoid.kernels.kinematics import REVOLUTE, compose, turn
 from qpavoid.kernels.near_pairs import place_body
 from qpavoid.kernels.packing import compiled, inlined
+from qpavoid.kernels.planning_motion import begin_motion, change_within, fraction_until, write_speeds
 from qpavoid.kernels.pose_fit import extrapolate
 from qpavoid.problem import Array, IntArray
 
@@ -69,6 +70,10 @@ class PlanningArrays(NamedTuple):
     """(k,) row of `lever`."""
     lever: Array
     """(r, n) bound on the change of a distance per unit of each coordinate [m/rad or 1]."""
+    body_lever: Array
+    """(g, e) bound on the travel of each body's points per unit of the coordinate of each column [m/rad or 1]."""
+    factors: Array
+    """(e,) turn or shift of each column per unit of its coordinate: 1, but for joints that mimic others [-]."""
     obstacle: IntArray
     """(k,) number of the obstacle in the pair, that is not attached; -1 for none."""
     point_speed: Array
@@ -101,8 +106,20 @@ class PlanningArrays(NamedTuple):
     """(r,) scratch: bound on the change of distances along the motion that is checked, by rows of `lever` [m]."""
     rates: Array
     """(k,) scratch: the same of each pair, with the motion of its obstacle [m]."""
+    change: Array
+    """(n,) scratch: change of the coordinates along the motion [rad or m]."""
+    bends: Array
+    """(g,) scratch: bound on the second derivative of each body's points along the motion [m]."""
+    speeds: Array
+    """(g,) scratch: largest speed of each body's points at a sample, along the whole motion as 1 [m]."""
+    twists: Array
+    """(J, 6) scratch: the same of each joint's origin, linear, then angular; 0 of the world."""
     stretches: Array
     """(_STACK, 2) scratch: stretches of a motion that are not covered yet."""
+    near: IntArray
+    """(k,) scratch: pairs that come near on the motion that is checked, the tightest of the last sample first."""
+    tightest: IntArray
+    """(1,) the pair that covered least of the last motion, which is looked at first in the next one."""
     q: Array
     """(n,) scratch: a sample of the motion."""
     checks: IntArray
@@ -219,32 +236,52 @@ def pair_clearances(x: Any, q: Array, t: float, limit: float, out: Array) -> Non
 @compiled
 def is_clear(x: Any, q: Array, t: float, need: Array) -> bool:
     """Return True if every pair has the distance that a sample needs: need (k,) and `FINE` more."""
-    return _covered(x, q, t, need, 0.0) >= 0.0
+    place(x, q, t)
+    return _covered(x, need, 0.0, _gather(x, need, 0.0)) >= 0.0
 
 
 @compiled
-def _covered(x: Any, q: Array, t: float, need: Array, most: float) -> float:
+def _gather(x: Any, need: Array, most: float) -> int:
+    """Write which pairs the poses of now do not show to be clear for a fraction of the motion; return their number."""
+    centers, first, second, radii = x.distances.centers, x.first, x.second, x.radii
+    near, tightest, count = x.near, x.tightest[0], 0
+    for k in range(len(need)):
+        span = need[k] + max(change_within(x, k, most), FINE) + radii[k]
+        if span > 0.0 and _square(centers, first[k], centers, second[k]) < span * span:
+            near[count] = k
+            if k == tightest:
+                near[count], near[0] = near[0], k
+            count += 1
+    return count
+
+
+@compiled
+def _covered(x: Any, need: Array, most: float, count: int) -> float:
     """Return the fraction of the motion, at most `most`, that a sample covers on each side; -1 where it is not clear.
 
     Args:
-        x: reads the rates of the motion.
-        q: sample (n,).
-        t: its time [s].
+        x: at the poses and speeds of the sample.
         need: distance that each pair needs (k,) [m].
         most: fraction of the motion.
+        count: number of near pairs.
     """
-    place(x, q, t)
     x.checks[0] += 1
-    centers, first, second, radii, rates = x.distances.centers, x.first, x.second, x.radii, x.rates
-    for k in range(len(need)):
-        limit = need[k] + max(rates[k] * most, FINE)
+    centers, first, second, radii, near, tightest = x.distances.centers, x.first, x.second, x.radii, x.near, -1
+    for i in range(count):
+        k = near[i]
+        limit = need[k] + max(change_within(x, k, most), FINE)
         span = limit + radii[k]
         if span > 0.0 and _square(centers, first[k], centers, second[k]) < span * span:
             distance = distance_below(x, k, limit)
             if distance < limit:
+                tightest = i
                 if distance < need[k] + FINE:
-                    return -1.0
-                most = min(most, (distance - need[k]) / rates[k])
+                    most = -1.0
+                    break
+                most = min(most, fraction_until(x, k, distance - need[k]))
+    if tightest >= 0:
+        x.tightest[0] = near[tightest]
+        near[tightest], near[0] = near[0], near[tightest]
     return most
 
 
@@ -255,8 +292,11 @@ def is_clear_between(x: Any, a: Array, ta: float, b: Array, tb: float, need: Arr
     Conservative: a motion on which some pair has less than `FINE` beyond what it needs (k,) may count as not clear.
     """
     n, stretches, q = len(a), x.stretches, x.q
-    _write_rates(x, a, b, abs(tb - ta))
-    end = _covered(x, b, tb, need, 1.0)
+    begin_motion(x, a, b, abs(tb - ta))
+    place(x, b, tb)
+    write_speeds(x)
+    near = _gather(x, need, 1.0)
+    end = _covered(x, need, 1.0, near)
     if end < 0.0:
         return False
     count = 1
@@ -269,7 +309,9 @@ def is_clear_between(x: Any, a: Array, ta: float, b: Array, tb: float, need: Arr
         s = 0.5 * (low + high)
         for i in range(n):
             q[i] = a[i] + s * (b[i] - a[i])
-        covered = _covered(x, q, ta + s * (tb - ta), need, s - low)
+        place(x, q, ta + s * (tb - ta))
+        write_speeds(x)
+        covered = _covered(x, need, s - low, near)
         if covered < 0.0 or count + 2 > _STACK:
             return False
         if covered < s - low:
@@ -279,26 +321,15 @@ def is_clear_between(x: Any, a: Array, ta: float, b: Array, tb: float, need: Arr
     return True
 
 
-@compiled
-def _write_rates(x: Any, a: Array, b: Array, duration: float) -> None:
-    """Write the rates of the straight motion from a to b (n,) in some time [s]."""
-    lever, row_rates, rates, row, obstacle, speed = x.lever, x.row_rates, x.rates, x.row, x.obstacle, x.point_speed
-    for r in range(len(lever)):
-        rate = 0.0
-        for i in range(len(a)):
-            rate += lever[r, i] * abs(b[i] - a[i])
-        row_rates[r] = rate
-    for k in range(len(rates)):
-        rates[k] = row_rates[row[k]] + duration * speed[obstacle[k]]
-
-
-def scratch(n: int, rows: int, pairs: int) -> dict[str, Any]:
+def scratch(n: int, rows: int, pairs: int, bodies: int, joints: int) -> dict[str, Any]:
     """Return the memory of `PlanningArrays` that nothing is read from before it is written.
 
     Args:
         n: number of coordinates.
         rows: number of rows of `lever`.
         pairs: number of pairs that count.
+        bodies: number of bodies.
+        joints: number of joints, that of the world among them.
     """
     return {
         "simplex": np.empty((4, 10)),
@@ -308,6 +339,12 @@ def scratch(n: int, rows: int, pairs: int) -> dict[str, Any]:
         "row_rates": np.zeros(rows),
         "rates": np.zeros(pairs),
         "stretches": np.empty((_STACK, 2)),
+        "change": np.zeros(n),
+        "bends": np.zeros(bodies),
+        "speeds": np.zeros(bodies),
+        "twists": np.zeros((joints, 6)),
+        "near": np.empty(pairs, dtype=np.intp),
+        "tightest": np.full(1, -1, dtype=np.intp),
         "q": np.empty(n),
         "checks": np.zeros(1, dtype=np.intp),
     }

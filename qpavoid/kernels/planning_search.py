@@ -49,7 +49,7 @@ def search(
         near: coordinates (n,) next to which goals are looked for first.
         arrival: time of the goals [s]; 0 where obstacles rest.
         needs: distances that the pairs need (c, k), tried in turn [m].
-        least: distance that pairs need next to a given goal that has no more (k,) [m].
+        least: distance that pairs need next to a goal, if no goal has more (k,) [m].
         first_nodes: of the first trees, with each row of `needs`: a path with less clearance, if it is soon found, is
             better than a long search.
         max_nodes: of the last trees, with the last row.
@@ -80,6 +80,8 @@ def search(
                     break
                 counts[level] = len(some)
                 ends[level, : len(some), :n] = some
+                if len(some) == 0 and level == levels - 1:
+                    counts[level] = _given_goals(x, attained[: searches[1]], arrival, need, least, ends[level])
             else:
                 counts[level] = _given_goals(x, goals, arrival, need, least, ends[level])
             ending = max(ending, NO_CLEAR_GOAL)

@@ -31,6 +31,41 @@ class RampLimits(NamedTuple):
 
 
 @compiled
+def velocity_towards(
+    gap: Array, change: Array, v_last: Array, max_speed: Array, v_step: Array, dt: float, out: Array
+) -> None:
+    """Write the velocity that closes a gap in a control step; where that is too fast, one straight towards its end.
+
+    It is at most the fastest from which braking by `v_step` takes no more than the gap, or that at which the end of the
+    gap moves, within `max_speed` and `v_step`.
+
+    Args:
+        gap: to what is to be reached (n,) [rad or m].
+        change: by which its end has moved since the control step before (n,).
+        v_last: velocity (n,) of that step [rad/s or m/s].
+        max_speed: (n,).
+        v_step: largest change of v in a control step (n,), finite.
+        dt: control period [s].
+        out: (n,).
+    """
+    passes, slowed = True, 1.0
+    for j in range(len(gap)):
+        out[j] = gap[j] / dt
+        usual = max(abs(change[j]) / dt, v_step[j])
+        passes = passes and abs(out[j]) <= min(usual, max_speed[j]) and abs(out[j] - v_last[j]) <= v_step[j]
+    if passes:
+        return
+    for j in range(len(gap)):
+        usual = max(abs(change[j]) / dt, v_step[j])
+        towards = v_last[j] if out[j] > 0.0 else -v_last[j] if out[j] < 0.0 else 0.0
+        fastest = max(_speed_to_stop(abs(gap[j]), v_step[j], dt), usual)
+        fastest = min(fastest, max_speed[j], max(towards, 0.0) + v_step[j])
+        slowed = max(slowed, abs(out[j]) / fastest)
+    for j in range(len(gap)):
+        out[j] /= slowed
+
+
+@compiled
 def follow_ramp(x: RampLimits, v: Array, dv: Array, targets: Array, is_constant: bool, stop_when_met: bool) -> Array:
     """Compute velocities of successive control steps, each as close to its target as the limits allow.
 

@@ -9,13 +9,14 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from qpavoid.kernels.backup import backup_rows, closes_below
-from qpavoid.kernels.near_pairs import place_obstacles
+from qpavoid.kernels.backup import backup_rows, closes_below, max_offset
+from qpavoid.kernels.kinematics import update_kinematics
+from qpavoid.kernels.near_pairs import place_bodies, place_obstacles
 from qpavoid.kernels.packing import compiled
 from qpavoid.kernels.prediction import Prediction, predict
 from qpavoid.kernels.qp import max_clearance_velocity
 from qpavoid.kernels.ramps import RampLimits, follow_ramp
-from qpavoid.kernels.step import find_near_pairs
+from qpavoid.kernels.rollout_pairs import PairMemory, forget_pairs, near_pairs_along
 from qpavoid.problem import Array, Mask
 
 HORIZON = 1.5
@@ -102,6 +103,8 @@ class RolloutArrays(NamedTuple):
     """(m,) enabled pairs that were not in contact so far."""
     states: Array
     """(o, 18) of the obstacles at the pose."""
+    pairs: PairMemory
+    """Of their distances."""
 
 
 @compiled
@@ -126,6 +129,7 @@ def begin_rollout(
     s.stage, s.pose, s.steps, s.near, s.span = PLACE, _START, 0, 0, 0.0
     s.contact_time, s.lost_time, s.clearance, s.clearance_before = np.inf, 0.0, np.inf, np.inf
     r.q_pose[:], r.v_pose[:] = r.q[0], r.v[0]
+    forget_pairs(r.pairs)
 
 
 @compiled
@@ -141,6 +145,22 @@ def rollout_outcome(r: Any) -> tuple[int, float, float, float]:
     """
     s = r.progress[0]
     return s.steps, HORIZON - s.lost_time, min(s.contact_time, s.t), s.clearance
+
+
+@compiled
+def offset_of_start(r: Any, offset: Array, v: Array, dv: Array, targets: Array, is_accelerated: bool) -> float:
+    """Compute `max_offset` from a trajectory that is joined from another start.
+
+    Args:
+        r: memory, see `RolloutArrays`; not changed.
+        offset: of the start from that of the trajectory (n,) [rad or m].
+        v: velocity of the control step before (n,).
+        dv: change of velocity in that step (n,).
+        targets: velocities of the trajectory (k, n).
+        is_accelerated: whether any acceleration has a limit; without one, the first target is met at once.
+    """
+    ramp = follow_ramp(r.ramp_limits, v, dv, targets, False, True) if is_accelerated else targets[:0]
+    return max_offset(offset, ramp, targets, r.progress[0].dt)
 
 
 @compiled
@@ -179,7 +199,11 @@ def advance_rollout(r: Any, x: Any, prediction: Prediction) -> tuple[int, int, i
             bad, s.is_moving = place_obstacles(x.distances, prediction.which, r.states, prediction.margin)
             if bad >= 0:
                 return NOT_FINITE, bad, 0, 0
-            near, s.rows, meeting = find_near_pairs(x, r.q_pose)
+            update_kinematics(x.kinematics, r.q_pose)
+            place_bodies(x.distances, x.joint_poses)
+            near, s.rows, meeting = near_pairs_along(
+                x.distances, r.pairs, prediction.which, s.pose == _START, s.influence_distance, PREFERRED_DISTANCE
+            )
             if meeting > 0 or s.completes_outside:
                 return TO_MEASURE, near, s.rows, meeting
         if _evaluate(r, x):
@@ -260,7 +284,7 @@ def _evaluate(r: Any, x: Any) -> bool:
     x.v_prev[:] = r.v_pose
     pairs = x.distances.rows[: s.rows]
     k, touching, nearest, separable = backup_rows(
-        x, r.q_pose, pairs, s.influence_distance, s.is_moving, r.enabled, TOUCH
+        x, r.q_pose, pairs, r.pairs.bounds, s.influence_distance, s.is_moving, r.enabled, TOUCH
     )
     s.near, s.t = k, s.t_pose
     if touching > 0:

@@ -9,6 +9,7 @@ from numba import config, typeof, types
 from numba.experimental import structref
 
 from qpavoid.kernels.approach import ApproachArrays
+from qpavoid.kernels.dynamics import DynamicsArrays
 from qpavoid.kernels.estimates import ObstacleArrays
 from qpavoid.kernels.kinematics import KinematicsArrays
 from qpavoid.kernels.layout import RowLayout
@@ -44,6 +45,15 @@ class PackedRollout(structref.StructRefProxy):  # type: ignore[misc]
 
 class PackedObstacles(structref.StructRefProxy):  # type: ignore[misc]
     """`ObstacleArrays` in compiled code."""
+
+
+class PackedDynamics(structref.StructRefProxy):  # type: ignore[misc]
+    """`DynamicsArrays` in compiled code."""
+
+
+@structref.register
+class PackedDynamicsType(_Structure):
+    """Type of `PackedDynamics`."""
 
 
 @structref.register
@@ -97,6 +107,7 @@ for proxy, kind, fields in (
     (PackedApproach, PackedApproachType, ApproachArrays._fields),
     (PackedPlanning, PackedPlanningType, PlanningArrays._fields),
     (PackedObstacles, PackedObstaclesType, ObstacleArrays._fields),
+    (PackedDynamics, PackedDynamicsType, DynamicsArrays._fields),
 ):
     structref.define_boxing(kind, proxy)
     structref.define_constructor(proxy, kind, list(fields))
@@ -144,6 +155,12 @@ def _pack_obstacles(fields: Any) -> Any:
     return PackedObstacles(*fields)
 
 
+@compiled
+def _pack_dynamics(fields: Any) -> Any:
+    """Return a structure of the fields of `DynamicsArrays`."""
+    return PackedDynamics(*fields)
+
+
 _PACK = {
     KinematicsArrays: _pack_kinematics,
     DistanceArrays: _pack_distances,
@@ -152,6 +169,7 @@ _PACK = {
     ApproachArrays: _pack_approach,
     PlanningArrays: _pack_planning,
     ObstacleArrays: _pack_obstacles,
+    DynamicsArrays: _pack_dynamics,
 }
 
 
@@ -162,7 +180,8 @@ def pack(
     | RolloutArrays
     | ApproachArrays
     | ObstacleArrays
-    | PlanningArrays,
+    | PlanningArrays
+    | DynamicsArrays,
 ) -> Any:
     """Return memory in the form that the kernels take; both look into the same arrays.
 

@@ -67,7 +67,7 @@ def set_limits(model: Any, limits: JointLimits, path: Path) -> None:
     """
     lower, upper = np.array(model.lowerPositionLimit), np.array(model.upperPositionLimit)
     velocity = np.array(model.velocityLimit)
-    for kind in ("position", "velocity", "acceleration", "jerk"):
+    for kind in ("position", "velocity", "acceleration", "jerk", "torque"):
         for name in getattr(limits, kind):
             if find_joint(model, name, f"{path}: limits.{kind}").shortname() == MIMIC:
                 raise ConfigError(f"{path}: limits.{kind}: {_follows(model, name)}; limit that one")

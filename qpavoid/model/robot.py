@@ -58,6 +58,8 @@ class Robot:
     """Joint: largest acceleration [rad/s² or m/s²]; joints left out have no such limit."""
     jerk: Mapping[str, float] = field(default_factory=dict)
     """Joint: largest jerk [rad/s³ or m/s³]; joints left out have no such limit."""
+    torque: Mapping[str, float] = field(default_factory=dict)
+    """Joint: largest torque or force [Nm or N], where it is not that of the file."""
     notes: tuple[Note, ...] = ()
     """What was left out, mended, replaced or assumed at loading."""
     urdf: Path = Path()
@@ -160,6 +162,7 @@ class Robot:
             margins=pair_margins(config, bodies, path),
             acceleration=config.limits.acceleration,
             jerk=config.limits.jerk,
+            torque=config.limits.torque,
             urdf=urdf,
             package_dirs=tuple(absolute_entries(config.package_dirs, path.parent)),
         )
@@ -233,6 +236,14 @@ class Robot:
             for limits in (self.acceleration, self.jerk)
         )
         return replace(joint_bounds(self.model), acceleration=acceleration, jerk=jerk)
+
+    def torque_limits(self) -> Array:
+        """Return the largest torques or forces (nv,) [Nm or N]; 0 where neither robot.yaml nor URDF gives one."""
+        limits = np.array(self.model.effortLimit)
+        for name, joint in self._joints():
+            limits[joint.idx_v : joint.idx_v + joint.nv] = self.torque.get(name, limits[joint.idx_v])
+        limits[~np.isfinite(limits)] = 0.0
+        return limits
 
     def configuration(self, values: Sequence[float] | Mapping[str, float], where: str = "q") -> Array:
         """Return the full configuration (nq,) of a scenario's `q0`.

@@ -5,18 +5,19 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from math import isfinite
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 import pinocchio as pin
 
-from qpavoid.config import Planning, Sensing, SolverConfig
+from qpavoid.config import Planning, RelativeTask, Sensing, SolverConfig
 from qpavoid.control.builder import ProblemBuilder
 from qpavoid.control.contacts import ContactRows
 from qpavoid.control.obstacle_states import ObstacleStates
 from qpavoid.control.scene_changes import SceneChanges
 from qpavoid.control.settings import ControlSettings
 from qpavoid.control.tasks import FrameTask, RowTask
+from qpavoid.control.tasks.relative import Relative
 from qpavoid.control.trajectories import extrapolate
 from qpavoid.model.sample import Sample
 from qpavoid.model.trajectory import Trajectory
@@ -194,13 +195,17 @@ class Forecaster(SceneChanges):
         return tracker.current._replace(states=states)
 
     def targets_at(self, start: Snapshot, t: float) -> dict[str | tuple[str, str], Any]:
-        """Return targets of the frames at a time [s]: poses, or positions or orientations alone."""
+        """Return targets of the frames at a time [s], in the axes of the world or of another frame."""
         targets: dict[str | tuple[str, str], Any] = {}
         for task in self._tasks:
+            if not isinstance(task, FrameTask | Relative):
+                continue
+            target = start.targets.get(task.settings.label) or task.motion.sample(t)
             if isinstance(task, FrameTask):
-                target = start.targets.get(task.settings.label) or task.motion.sample(t)
-                only = target.position if task.moves else target.rotation
-                targets[task.settings.frame] = target if task.moves and task.turns else only
+                targets[task.settings.frame] = _part(target, task.moves, task.turns)
+            else:
+                block = cast(RelativeTask, task.settings)
+                targets[block.frame, block.relative_to] = _part(target, task.moves, block.rows != "position")
         return targets
 
     def _restart(self, start: Snapshot) -> None:
@@ -216,6 +221,11 @@ class Forecaster(SceneChanges):
         self._least[:] = np.where(is_movable, distances.d1, -np.inf)
         pairs = distances.pair
         self._least[pairs] = np.minimum(self._least[pairs], distances.d - _PRESENT)
+
+
+def _part(target: Any, moves: bool, turns: bool) -> Any:
+    """Return what of a target counts: its pose, its position or its orientation."""
+    return target if moves and turns else target.position if moves else target.rotation
 
 
 def _pair_of(stalled: tuple[Reason, ...]) -> str:

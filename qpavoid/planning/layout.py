@@ -114,10 +114,11 @@ class PlanLayout:
         there and the points; where it has no limits, half a turn to both sides of the first point.
         """
         low, high, turning = points.min(axis=0), points.max(axis=0), np.isinf(self._lower)
-        angle = np.zeros(len(low), dtype=bool)
-        angle[self._columns[self._turns]] = True
-        lower = np.where(angle, np.maximum(self._lower, -np.pi), self._lower)
-        upper = np.where(angle, np.minimum(self._upper, np.pi), self._upper)
+        winding = np.zeros(len(low), dtype=bool)
+        winding[self._columns[self._turns]] = True
+        winding &= self._upper - self._lower > 2.0 * np.pi
+        lower = np.where(winding, np.maximum(self._lower, -np.pi), self._lower)
+        upper = np.where(winding, np.minimum(self._upper, np.pi), self._upper)
         lower[turning], upper[turning] = points[0, turning] - np.pi, points[0, turning] + np.pi
         return np.minimum(lower, low), np.maximum(upper, high)
 
@@ -191,7 +192,7 @@ class PlanLayout:
         self.pairs: IntArray = np.flatnonzero(selected)
         """(k,) numbers of the pairs that count."""
         first, second = self.first, self.second = np.ascontiguousarray(scene.pairs[self.pairs].T, dtype=np.intp)
-        levers = self._body_levers()
+        levers = self.body_lever = self._body_levers()
         rows = np.abs(table.support[self.pairs]) * (levers[first] + levers[second])
         folded = np.zeros((len(rows), self._model.nv))
         np.add.at(folded.T, self._columns, rows.T)
@@ -276,6 +277,8 @@ class PlanLayout:
             cloud=self.cloud,
             row=self.row,
             lever=self.lever,
+            body_lever=self.body_lever,
+            factors=self._levers,
             obstacle=self.obstacle,
             point_speed=np.append(np.where(clouds, 0.0, point_speed), 0.0),
             moving=np.flatnonzero((point_speed > 0.0) & ~clouds),
@@ -286,7 +289,7 @@ class PlanLayout:
             cloud_start=cloud_start,
             columns=self._columns,
             frame_support=support,
-            **scratch(self._model.nv, len(self.lever), len(self.pairs)),
+            **scratch(self._model.nv, len(self.lever), len(self.pairs), len(self.body_lever), self._model.njoints),
         )
 
     def _voxels(self, states: Array) -> tuple[Array, Array, IntArray, IntArray]:

@@ -97,4 +97,4 @@ def plan_to(
     except UnknownName:
         raise
     except ConfigError as error:
-        return no_path(scene, Reason.of(ReasonKind.NOT_PLANNED, detail=str(error)))
+        return no_path(scene, Reason.of(ReasonKind.NO_PLAN, detail=str(error)))

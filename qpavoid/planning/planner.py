@@ -42,7 +42,7 @@ class PlannerSettings:
     """Fraction of the joints' speed limits that the times of a path use [-]."""
     max_speed: float = 1.8
     """Speed that they use at most [rad/s or m/s]."""
-    longest: float = 1.0
+    longest: float = 0.5
     """Length of an edge of the search trees at most [m]: roughly the travel of the fastest point of the robot."""
     first_nodes: int = 80
     """Nodes of the first trees, with each clearance: a path with less, soon found, is better than a long search."""
@@ -130,7 +130,7 @@ class Planner:
         self._distances.arrays.guesses[:] = 0.0  # so that nothing depends on earlier plans
         states = self._distances.arrays.states.copy()
         if arrivals and (refusal := self._refuse_times(states)):
-            return no_path(self.scene, Reason.of(ReasonKind.NOT_PLANNED, detail=refusal))
+            return no_path(self.scene, Reason.of(ReasonKind.NO_PLAN, detail=refusal))
         x = layout.arrays(states, np.vstack((*points, *ends)), self._speed, s.longest, frames)
         return self._search(
             x, start, ends, poses or NO_TARGETS, points[-1], tuple(arrivals) or (0.0,), seed & _SEED,

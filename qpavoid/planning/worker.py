@@ -19,6 +19,7 @@ from qpavoid.config import Planning, SolverConfig
 from qpavoid.control.contacts import ContactRows
 from qpavoid.control.settings import ControlSettings
 from qpavoid.control.tasks import RowTask
+from qpavoid.control.tasks.com import Com
 from qpavoid.errors import ConfigError
 from qpavoid.planning.candidates import Candidates, Outcome
 from qpavoid.planning.forecast import Forecaster, Snapshot
@@ -202,6 +203,8 @@ def _make_planner(forecaster: Forecaster, parts: Parts) -> tuple[Planner | None,
         return None, ""
     if parts.contacts is not None:
         return None, "paths do not hold contacts"
+    if any(isinstance(task, Com) for task in parts.tasks):
+        return None, "paths do not hold the centre of mass, which a task has"
     settings = PlannerSettings(parts.settings.safety_distance, config.clearances, velocity_scale=config.speed)
     try:
         planner, home = Planner(forecaster.scene, settings, forecaster.distances()), forecaster.scene.robot.home

@@ -14,11 +14,11 @@ import numpy.typing as npt
 from qpavoid.errors import ConfigError
 from qpavoid.problem import Array, IntArray, Status
 from qpavoid.reason import Severity
-from qpavoid.run.metrics import path_deviation
+from qpavoid.run.metrics import path_deviation, torque_figures
 
 STATUSES = tuple(Status)
 """Status of each code in `Log.status`."""
-_FORMAT = 7
+_FORMAT = 8
 _SHAPES = {
     "t": "N", "q": "N nq", "v": "N nv",
     "target": "N k 3", "tool": "N k 3", "tool_rotation": "N k 3 3", "turn_error": "N k",
@@ -27,6 +27,7 @@ _SHAPES = {
     "slack": "N", "saturation": "N", "build_time": "N", "solve_time": "N", "command_scale": "N", "stalled": "N",
     "severity": "N",
     "body_ends": "N b 2 3", "obstacle_position": "N o 3", "obstacle_rotation": "N o 3 3",
+    "torque": "N m", "contact_force": "N c 3", "slip": "N c",
 }  # fmt: skip
 """Shape of each array; a letter is the same number wherever it stands."""
 _TYPES = {"closest_pair": np.intp, "body_pair": np.intp, "status": np.int8, "stalled": np.bool_, "severity": np.int8}
@@ -39,7 +40,8 @@ _MAX_EVENTS = 20
 class Log:
     """Arrays of a run, one row a control step.
 
-    N steps, n joints, k frames that follow motions, s other tasks, b bodies, o obstacles.
+    N steps, n joints, k frames that follow motions, s other tasks, b bodies, o obstacles; of a run with a plant, m
+    motors and c contact points, else none.
 
     Distances are between surfaces [m]. Everything is in world axes and SI units.
     """
@@ -92,12 +94,18 @@ class Log:
     """(N, o, 3) origin of each obstacle [m]."""
     obstacle_rotation: Array
     """(N, o, 3, 3) orientation of each obstacle."""
+    torque: Array
+    """(N, m) torques of the motors at the end of the step [Nm or N]; limits are in `meta["torque_limit"]`."""
+    contact_force: Array
+    """(N, c, 3) force of the floor on each contact point at the end of the step [N]."""
+    slip: Array
+    """(N, c) how far each contact point is then from where it was at the start, along the floor [m]."""
     meta: dict[str, Any] = field(default_factory=dict)
     """Names, shapes, limits, the scenario's configuration, versions, and how the run ended."""
 
     @classmethod
     def allocate(cls, sizes: dict[str, int]) -> dict[str, Any]:
-        """Lay out the arrays of a run; `sizes` has the numbers N, nq, nv, k, s, b, o of the shapes above."""
+        """Lay out the arrays of a run; `sizes` has the numbers N, nq, nv, k, s, b, o, m, c of the shapes above."""
         sides = {"2": 2, "3": 3, **sizes}
         shapes = {name: [sides[letter] for letter in letters.split()] for name, letters in _SHAPES.items()}
         return {name: np.zeros(shape, dtype=_TYPES.get(name, np.float64)) for name, shape in shapes.items()}
@@ -122,7 +130,8 @@ class Log:
             nothing is paired; min_pair: names of that pair; time_in_collision [s]; time_below: threshold ->
             [s]; final_error [m]; max_deviation: largest distance of a tool from its planned path [m];
             tracking_rmse: of the distance to the moving target [m]; peak_velocity: fastest joint [rad/s or
-            m/s]; jitter: Σ|Δq̇| over joints and ticks [rad/s]; status_counts; relaxed_ticks;
+            m/s]; jitter: Σ|Δq̇| over joints and ticks [rad/s]; torque: of a run with motors, share of their
+            limits that was used, Σ|Δτ| [Nm/s] and slip of a contact point [m], else None; status_counts; relaxed_ticks;
             shortened_ticks: steps scaled down by the stop look-ahead; time_blocked: stalled [s];
             severity_counts: steps by the worst severity of their reasons; events: the first changes of
             reasons, as [t, status, reasons as data]; tick_us: p50, p99 and max of the computation time of a
@@ -160,6 +169,7 @@ class Log:
             "tracking_rmse": float(np.sqrt(np.mean(error**2))) if error.size else float("nan"),
             "peak_velocity": float(np.max(np.abs(self.v), initial=0.0)),
             "jitter": float(np.sum(np.abs(np.diff(self.v, axis=0)))),
+            "torque": torque_figures(self.torque, self.meta["torque_limit"], self.slip, dt),
             "status_counts": counts,
             "relaxed_ticks": counts[Status.RELAXED.value],
             "shortened_ticks": int(np.sum(self.command_scale < 1.0)),

@@ -1,6 +1,8 @@
-"""How far a tool is off the path that was planned for it."""
+"""How far a tool is off the path that was planned for it, and what motors did."""
 
 from __future__ import annotations
+
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -38,3 +40,26 @@ def path_deviation(tool: Array, target: Array, corners: int = 500) -> Array:
         for start, end in zip(path, np.concatenate((path[1:], path[-1:])), strict=True):
             deviation[:, task] = np.minimum(deviation[:, task], point_segment_distance(tool[:, task], start, end))
     return deviation
+
+
+def torque_figures(torque: Array, limit: Sequence[float | None], slip: Array, dt: float) -> dict[str, float] | None:
+    """Compute the figures of motors; None where there are none.
+
+    Args:
+        torque: (N, m) of the motors [Nm or N].
+        limit: m largest ones, None where there is none [Nm or N].
+        slip: (N, c) of contact points [m].
+        dt: control period [s].
+
+    Returns:
+        share: largest torque over its limit [-]; jitter: Σ|Δτ| over motors, per second [Nm/s]; slip: largest one [m].
+    """
+    if not torque.size:
+        return None
+    limits = np.array([np.inf if largest is None else largest for largest in limit])
+    changes = np.abs(np.diff(torque, axis=0)).sum()
+    return {
+        "share": float(np.max(np.abs(torque) / limits)),
+        "jitter": float(changes / (dt * len(torque))),
+        "slip": float(np.max(slip, initial=0.0)),
+    }

@@ -109,12 +109,10 @@ def build(scene: Scene, q0: Array, has_servos: bool = False) -> MujocoModel:
     for i in range(1, robot.njoints):
         placement = robot.jointPlacements[i]
         body = bodies[robot.parents[i]].add_body(
-            name=robot.names[i], pos=placement.translation, quat=_quaternion(placement.rotation),
-            explicitinertial=True, **_inertia(robot.inertias[i] if has_servos else pin.Inertia.Zero()),
+            name=robot.names[i], pos=placement.translation, quat=quaternion(placement.rotation),
+            explicitinertial=True, **body_inertia(robot.inertias[i] if has_servos else pin.Inertia.Zero()),
         )  # fmt: skip
-        slides, axis = hinge_or_slide(robot, i)
-        kind = mujoco.mjtJoint.mjJNT_SLIDE if slides else mujoco.mjtJoint.mjJNT_HINGE
-        joint = body.add_joint(name=robot.names[i], type=kind, axis=axis)
+        joint = add_joint(body, robot, i)
         if robot.joints[i].idx_q in ranges:  # neither kinematics nor integration heed them; who reads the model may
             joint.limited, joint.range = True, ranges[robot.joints[i].idx_q]
         if has_servos:
@@ -146,19 +144,26 @@ def build(scene: Scene, q0: Array, has_servos: bool = False) -> MujocoModel:
     return mujoco_model
 
 
-def _inertia(inertia: Any) -> dict[str, Any]:
+def add_joint(body: Any, model: Any, index: int) -> Any:
+    """Add a hinge or slide of a pinocchio model to a body, and return it; see `hinge_or_slide`."""
+    slides, axis = hinge_or_slide(model, index)
+    kind = mujoco.mjtJoint.mjJNT_SLIDE if slides else mujoco.mjtJoint.mjJNT_HINGE
+    return body.add_joint(name=model.names[index], type=kind, axis=axis)
+
+
+def body_inertia(inertia: Any) -> dict[str, Any]:
     """Return mass and inertia of a body; units where the model gives none, which kinematics do not heed."""
     moments, axes = np.linalg.eigh(inertia.inertia)
     if not (inertia.mass > 0.0 and moments[0] > 0.0):
         return {"mass": 1.0, "inertia": [1.0, 1.0, 1.0]}
     axes[:, 0] *= np.linalg.det(axes)
-    return {"mass": inertia.mass, "ipos": inertia.lever, "inertia": moments, "iquat": _quaternion(axes)}
+    return {"mass": inertia.mass, "ipos": inertia.lever, "inertia": moments, "iquat": quaternion(axes)}
 
 
 def _add_geom(spec: Any, body: Any, geometry: Any, name: str, placement: Any) -> None:
     """Add a geometry by a name to a body of the MuJoCo model."""
     kinds, shape = mujoco.mjtGeom, geometry.geometry
-    place = {"name": name, "pos": placement.translation, "quat": _quaternion(placement.rotation)}
+    place = {"name": name, "pos": placement.translation, "quat": quaternion(placement.rotation)}
     match shape:
         case coal.Sphere():
             body.add_geom(type=kinds.mjGEOM_SPHERE, size=_three(shape.radius), **place)
@@ -202,8 +207,8 @@ def _three(*sizes: float) -> Sequence[float]:
     return [*sizes, 0.0, 0.0][:3]
 
 
-def _quaternion(rotation: Array) -> Array:
+def quaternion(rotation: Array) -> Array:
     """Return the quaternion (4,), w first, of a rotation (3, 3)."""
-    quaternion = np.empty(4)
-    mujoco.mju_mat2Quat(quaternion, np.ascontiguousarray(rotation).ravel())
-    return quaternion
+    wxyz = np.empty(4)
+    mujoco.mju_mat2Quat(wxyz, np.ascontiguousarray(rotation).ravel())
+    return wxyz

@@ -52,6 +52,10 @@ class ApproachCheck:
         self.is_far(self._v, 0.0)  # compiled before any step
         self.reset()
 
+    def brake_with(self, acceleration: Array) -> None:
+        """Take accelerations (nv,) as those on which braking counts from now on [rad/s² or m/s²]."""
+        self._memory.braking[:] = 0.5 / acceleration
+
     def reset(self) -> None:
         """Drop the paths."""
         self._memory.numbers.fill(np.iinfo(np.intp).min)

@@ -105,7 +105,8 @@ class Arbiter:
         try:
             if from_tasks and problem.jerk_limited and problem.cascade is None:
                 problem = self._rows.within_jerks(problem)
-            solution = self.solver.solve(problem)
+            dynamics = self._rows.dynamics
+            solution = self.solver.solve(problem) if dynamics is None else dynamics.solve(self.solver, problem)
             v = solution.v
             usable = (
                 v.dtype == np.float64
@@ -124,6 +125,9 @@ class Arbiter:
             given = solution.reasons if _well_formed(problem, solution) else ()
             return _stop(problem, (*given, failed))
         if not self.solver.bounded:
+            if self._rows.dynamics is not None:
+                v = self._rows.dynamics.approach(v, self._rows.previous.v)
+                solution = solution._replace(v=v)
             if not self._settings.limits.saturate:
                 return solution
             v, change = saturate(v, problem.lower, problem.upper, self._settings.bounds.velocity)
@@ -155,6 +159,8 @@ class Arbiter:
         if result is None:
             return solution
         v, scale, violation, pair, distance = result
+        if _limits_torques(problem) and distance >= 0.0:
+            return solution
         if violation <= TOLERANCE:
             return solution._replace(v=v, command_scale=scale * solution.command_scale)
         names = self._settings.scene.pair_names[pair]
@@ -167,8 +173,10 @@ class Arbiter:
     def _ensure_backup(self, backup: BackupPlanner, q: Array, t: float, solution: Solution) -> Solution:
         """Replace the velocity by that of the backup trajectory, where none would be left after it."""
         rows = self._rows
+        if rows.dynamics is not None:
+            backup.brake_with(self._settings.bounds.acceleration)
         try:
-            v = backup.check(q, solution.v, t, rows.previous.v, rows.previous.dv, rows.proximity())
+            v = backup.check(q, solution.v, t, rows.previous.v, rows.previous.dv, rows.proximity)
         except NumericalError as error:  # of a predicted state; raised by `step` once it is the present one
             why = f"prediction of an {error}"
             return solution.with_reasons(Reason.of(ReasonKind.NO_BACKUP, severity=Severity.WARNING, detail=why))
@@ -200,9 +208,13 @@ class Arbiter:
         return solution.with_reasons(*excesses) if excesses else solution
 
 
+def _limits_torques(problem: Problem) -> bool:
+    return problem.dynamics is not None and problem.dynamics.torque_rows > 0
+
+
 def _clipped(problem: Problem, solution: Solution) -> Solution:
     """Clip the velocity of a `bounded` solver to the bounds that it has to keep, in case it does not."""
-    is_solved, v = solution.status is Status.SOLVED, solution.v
+    is_solved, v = solution.status is Status.SOLVED and not _limits_torques(problem), solution.v
     lower, upper = (problem.lower, problem.upper) if is_solved else (problem.hard_lower, problem.hard_upper)
     within = np.minimum(np.maximum(v, lower), upper)
     if within.tobytes() == v.tobytes():

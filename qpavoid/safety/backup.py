@@ -17,6 +17,7 @@ the velocity of the solver is commanded, whose stop was looked ahead.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from math import ceil, inf
 from typing import NamedTuple
 
@@ -32,8 +33,12 @@ from qpavoid.problem import Array, Mask, Proximity
 from qpavoid.safety.approach import ApproachCheck
 from qpavoid.safety.rollout import LEAST_SCORE, BackupPolicy, BackupRollouts, BackupScore, BackupTrajectory, Start
 
-_POSE_RATE = 10_000.0
-"""Poses of candidates that are evaluated per time [1/s]: at 10 to 20 µs each, a tenth to a fifth of it."""
+_PERIOD_FRACTION = 0.128
+"""Fraction of a control period in which candidates are computed [-]."""
+_POSE_TIME, _SEARCH_TIME = 12e-6, 80e-6
+"""Time that a pose of a candidate takes, and that a search takes besides [s]: of a Panda among 50 obstacles."""
+_FEWEST_POSES = 10
+"""Poses that are evaluated in a control step at least [-]: a candidate has about 45, and an obstacle does not wait."""
 _HORIZONS = (0.2, 0.05, 0.5)
 """h of backup policies [s]: the most successful first."""
 _UNBIASED_FRACTION = 0.25
@@ -48,7 +53,7 @@ _FIRST_CANDIDATES = 7
 _URGENT = 0.5
 """Time before a contact in which the best candidate is followed all the same [s]."""
 _PORTION = 4
-"""Poses that are evaluated, at 10 to 20 µs each, before a clock is read, where there is a budget [-]; of each control
+"""Poses that are evaluated, at 10 to 15 µs each, before a clock is read, where there is a budget [-]; of each control
 step, these at least."""
 _DISTANCE_TOLERANCE = 1e-6
 """Difference of two clearances that counts as none [m]."""
@@ -83,8 +88,8 @@ class BackupPlanner:
         self._model, self._obstacles, self._dt = settings.scene.robot.model, obstacles, settings.dt
         self._rollouts = BackupRollouts(settings, query.table, obstacles)
         self._approach = ApproachCheck(settings, query, self._rollouts.lever_arm, obstacles)
-        self._poses = max(1, round(_POSE_RATE * settings.dt))
-        """Poses that are evaluated in a control step."""
+        self._poses = max(_FEWEST_POSES, round((_PERIOD_FRACTION * settings.dt - _SEARCH_TIME) / _POSE_TIME))
+        """Poses of candidates that are evaluated in a control step: 100 at 100 Hz, 15 at 500 Hz."""
         self._steps_ahead = ceil(_CANDIDATES_AHEAD * self._rollouts.usual_poses / self._poses)
         """Control steps in which that many candidates are computed."""
         self._budget = settings.budget
@@ -98,6 +103,11 @@ class BackupPlanner:
         self._random = np.random.default_rng(0)
         self._approach.reset()
         self._forget()
+
+    def brake_with(self, acceleration: Array) -> None:
+        """Take accelerations (nv,) as those on which braking counts from now on [rad/s² or m/s²]."""
+        self._rollouts.brake_with(acceleration)
+        self._approach.brake_with(acceleration)
 
     def _forget(self) -> None:
         """Drop the kept trajectory and the candidate."""
@@ -118,7 +128,9 @@ class BackupPlanner:
         """Whether there is a backup trajectory or a candidate: while nothing moves, `check` would only drop it."""
         return self._backup is not None or self._kind >= 0
 
-    def check(self, q: Array, v: Array, t: float, v_prev: Array, dv_prev: Array, proximity: Proximity) -> Array | None:
+    def check(
+        self, q: Array, v: Array, t: float, v_prev: Array, dv_prev: Array, proximity: Callable[[], Proximity]
+    ) -> Array | None:
         """Return None if v may be commanded, else the velocity (nv,) to command instead.
 
         Args:
@@ -127,7 +139,7 @@ class BackupPlanner:
             t: time [s].
             v_prev: velocity (nv,) commanded in the control step before.
             dv_prev: change of velocity (nv,) in that step.
-            proximity: distances of this control step; pairs in contact do not count.
+            proximity: returns the distances of this control step; pairs in contact do not count.
         """
         self.is_cut = False
         is_same_scene = self._moving is self._obstacles.moving
@@ -136,7 +148,7 @@ class BackupPlanner:
             self._forget()
         if not is_near:
             return None
-        state = Start(q, v_prev.copy(), dv_prev.copy(), t, self._enabled(proximity))
+        state = Start(q, v_prev.copy(), dv_prev.copy(), t, self._enabled(proximity()))
         backup, after_task = self._backup, self._after(state, v)
         command = _Command(v, after_task, after_task, True)
         if backup is not None and len(backup.v):

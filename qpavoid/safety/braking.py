@@ -153,6 +153,8 @@ class BrakingCheck:
         if least.margin >= 0.0:
             return None
         best, cost = BrakingResult(v, 1.0, -least.margin, least.pair, least.distance), -least.margin
+        if problem.dynamics is not None and problem.dynamics.torque_rows:
+            return best  # rows see in every step what is wrong with a model, a stop does not
         straight = low_effort(problem, slack)
         full, scales = (v, _SCALES) if straight is None else (straight, (1.0, *_SCALES))
         for scale in scales:

@@ -33,11 +33,13 @@ from qpavoid.kernels.rollout import (
     FINISHED,
     HORIZON,
     NOT_FINITE,
+    PREFERRED_DISTANCE,
     PROGRESS,
     TO_MEASURE,
     TO_MOVE,
     RolloutArrays,
 )
+from qpavoid.kernels.rollout_pairs import PairMemory, near_pairs_along
 from qpavoid.model.kinematics import ForwardKinematics, max_lever_arm
 from qpavoid.model.limits import JointBounds
 from qpavoid.problem import Array, Mask
@@ -130,7 +132,8 @@ class BackupRollouts:
         # a velocity may be asked for that is farther away than jerk limits allow in a period
         free = replace(settings.bounds, jerk=np.full(model.nv, np.inf))
         relaxed = replace(settings, bounds=free, dt=self.period)
-        self.packed = kernels.pack(lay_out(relaxed, (), (), self.kinematics, self.query))
+        layout = lay_out(relaxed, (), (), self.kinematics, self.query)
+        self.packed, self._v_step = kernels.pack(layout), layout.v_step
         self._ramp_limits = _ramp_limits(settings.bounds, self._dt)
         self._is_accelerated = bool(np.isfinite(settings.bounds.acceleration).any())
         self.lever_arm = max(1.0, max_lever_arm(model, table.max_extension()))
@@ -152,8 +155,9 @@ class BackupRollouts:
         with suppress(NumericalError):  # of a trajectory that gives nonsense: the steps say so
             self.resume(2)
         self.result()
-        ramp = kernels.follow_ramp(self._ramp_limits, zero, zero, zero[None], False, True)
-        kernels.max_offset(zero, ramp, zero[None], self._dt)
+        self._offset_of_start = kernels.direct(
+            kernels.offset_of_start, self._packed_memory, zero, zero, zero, zero[None], self._is_accelerated
+        )
         kernels.prediction_error_bound(obstacles.prediction, obstacles.prediction, 0.0, self.query.obstacle_radii)
 
     def _lay_out(self, period_steps: int) -> RolloutArrays:
@@ -179,7 +183,12 @@ class BackupRollouts:
             v_pose=np.zeros(model.nv),
             enabled=self.enabled,
             states=self._obstacles.current.states.copy(),
+            pairs=lay_out_pairs(self.query),
         )
+
+    def brake_with(self, acceleration: Array) -> None:
+        """Take accelerations (nv,) as those on which braking counts from now on [rad/s² or m/s²]."""
+        self._v_step[:], self._ramp_limits.v_step[:] = acceleration * self.period, acceleration * self._dt
 
     @property
     def enabled(self) -> Mask:
@@ -210,10 +219,9 @@ class BackupRollouts:
         delay = abs(start.t - trajectory.start.t)
         if delay > self._dt or not _is_equal(trajectory.start.enabled, start.enabled):
             return False
-        offset, ramp = pin.difference(self._model, trajectory.start.q, start.q), trajectory.v[:0]
-        if self._is_accelerated:
-            ramp = kernels.follow_ramp(self._ramp_limits, start.v, start.dv, trajectory.v, False, True)
-        max_offset = kernels.max_offset(offset, ramp, trajectory.v, self._dt)
+        offset = pin.difference(self._model, trajectory.start.q, start.q)
+        v, dv = np.ascontiguousarray(start.v), np.ascontiguousarray(start.dv)
+        max_offset = self._offset_of_start(self._packed_memory, offset, v, dv, trajectory.v, self._is_accelerated)
         obstacle_offset = delay * max_obstacle_speed if delay > _ROUND_OFF else 0.0
         now, then = self._obstacles.prediction, trajectory.prediction
         if now is not then and (len(now.external) or len(then.external)):
@@ -298,7 +306,13 @@ class BackupRollouts:
         query, s = self.query, self._progress
         query.place(self._obstacles.at(s.t_pose, self._prediction))
         self.kinematics.compute(self._memory.q_pose)
-        query.compute(self.kinematics.joint_poses, _INFLUENCE_DISTANCE)
+        if self._has_kernels:  # only trajectories are of another class
+            kernels.place_bodies(query.packed, self.kinematics.joint_poses)
+            which, is_first = self._prediction.which, s.span == 0.0
+            near_pairs_along(query.packed, self._memory.pairs, which, is_first, _INFLUENCE_DISTANCE, PREFERRED_DISTANCE)
+            query.finish()
+        else:
+            query.compute(self.kinematics.joint_poses, _INFLUENCE_DISTANCE)
         s.rows, s.is_moving = len(query.pairs), query.is_moving
 
     def _move(self) -> None:
@@ -308,6 +322,22 @@ class BackupRollouts:
         for i in range(first, last):
             r.q[i + 1] = pin.integrate(self._model, r.q[i], self._dt * r.v[i + 1])
         r.q_middle[:] = pin.interpolate(self._model, r.q[first], r.q[last], 0.5)
+
+
+def lay_out_pairs(query: DistanceQuery) -> PairMemory:
+    """Lay out what a rollout knows of the pairs of a scene."""
+    m, g = len(query.arrays.pairs), len(query.arrays.poses)
+    return PairMemory(
+        radius=query.table.spheres[:, 3],
+        centers=np.zeros((g, 3)),
+        rotations=np.zeros((g, 9)),
+        travels=np.zeros(g),
+        computed=np.zeros(m),
+        limits=np.full(m, -inf),
+        bounds=np.full(m, inf),
+        points=np.zeros((m, 6)),
+        due=np.zeros(m, np.intp),
+    )
 
 
 def _is_equal(a: Mask, b: Mask) -> bool:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from enum import Enum
+from functools import partial
 from typing import Annotated, Any
 
 import msgpack
@@ -17,7 +18,7 @@ from qpavoid.config.explain import explain
 from qpavoid.errors import QpavoidError, nearest
 from qpavoid.model.cloud import Points
 from qpavoid.model.sample import Pose, Sample
-from qpavoid.problem import Solution
+from qpavoid.problem import Array, Solution
 
 VERSION = 1
 """Of the messages: a server answers none of another version."""
@@ -47,7 +48,7 @@ class Fault(str, Enum):
     BUSY = "BUSY"
     """Another client is in control."""
     HALTED = "HALTED"
-    """The robot was stopped since steps did not come in time: a `reset` begins anew."""
+    """The robot was stopped since steps did not come in time: a `reset` begins anew; or since the server ends."""
     SUPERSEDED = "SUPERSEDED"
     """A later step of the same client was there already."""
     LATE = "LATE"
@@ -86,16 +87,16 @@ class Place(Block):
     at_rest: Annotated[bool, Field(strict=True)] = False
     """Of an obstacle: it stays there until it is given again."""
 
-    def sample(self) -> Any:
-        """Return the form that `Controller.step` takes."""
+    def sample(self, rotation: Array | None = None) -> Any:
+        """Return the form that `Controller.step` takes; a quaternion that is left out is `rotation` (3, 3)."""
         bare = self.linear is None and self.angular is None
         if self.position is None:
             if self.quaternion is None:
                 raise ValueError("give a position or a quaternion")
             return Pose.at(np.zeros(3), self._rotation(), self.t, self.at_rest)
         if bare and self.quaternion is None and self.t is None and not self.at_rest:
-            return np.array(self.position)
-        turn = None if self.quaternion is None else self._rotation()
+            return np.array(self.position) if rotation is None else Pose.at(self.position, rotation)
+        turn = rotation if self.quaternion is None else self._rotation()
         if bare and not self.at_rest:
             return Pose.at(self.position, turn, self.t)
         return Sample.at(self.position, turn, self.linear, self.angular, self.t, self.at_rest)
@@ -117,11 +118,11 @@ class Target(Place):
     direction: Three | None = None
     """Of an axis."""
 
-    def sample(self) -> Any:
-        """Return the form that `Controller.step` takes."""
+    def sample(self, rotation: Array | None = None) -> Any:
+        """See `Place.sample`."""
         if self.q is not None:
             return np.array(self.q)
-        return np.array(self.direction) if self.direction is not None else super().sample()
+        return np.array(self.direction) if self.direction is not None else super().sample(rotation)
 
 
 class Update(Place):
@@ -240,8 +241,7 @@ def read_request(frames: Sequence[bytes]) -> Request:
         data = msgpack.unpackb(frames[0], raw=False, strict_map_key=True)
         if not isinstance(data, dict):
             raise Refusal(Fault.MALFORMED, f"a {type(data).__name__}, not a map")
-        given = data.get("seq")
-        seq = given if type(given) is int and 0 <= given < 2**53 else None
+        seq = _as_seq(data.get("seq", 0))
         if len(frames) > 1 + MAX_CLOUDS or max(map(len, frames)) > MAX_FRAME:
             raise Refusal(Fault.OVERSIZED, f"more than {MAX_CLOUDS} clouds, or {MAX_POINTS} points in one", seq)
         if data.get("version") != VERSION:
@@ -255,20 +255,42 @@ def read_request(frames: Sequence[bytes]) -> Request:
     except ValidationError as error:
         raise Refusal(Fault.MALFORMED, explain(error, REQUESTS[kind], data), seq) from None
     except (ValueError, TypeError, OverflowError, RecursionError, msgpack.UnpackException) as error:
+        seq = _seq_before_fault(frames[0]) if seq is None else seq
         raise Refusal(Fault.MALFORMED, f"no msgpack: {type(error).__name__}: {error}", seq) from None
 
 
-def targets_of(step: Step) -> dict[str, Any]:
-    """Return the targets of a step.
+def _as_seq(given: Any) -> int | None:
+    return given if type(given) is int and 0 <= given < 2**53 else None
+
+
+def _seq_before_fault(message: bytes) -> int | None:
+    """Return the `seq` of a message that cannot be read as a whole; None where it does not come before the fault."""
+    unpacker = msgpack.Unpacker(raw=True, strict_map_key=False)
+    unpacker.feed(message)
+    try:
+        for _ in range(unpacker.read_map_header()):
+            if unpacker.unpack() == b"seq":
+                return _as_seq(unpacker.unpack())
+            unpacker.skip()
+    except (ValueError, TypeError, OverflowError, RecursionError, msgpack.UnpackException):
+        pass
+    return None
+
+
+def targets_of(step: Step, rotations: Mapping[str, Array]) -> dict[str, Any]:
+    """Return the targets of a step; `rotations` are those (3, 3) in place of quaternions that are left out.
 
     Raises:
         Refusal: naming one.
     """
-    return {name: _named(f"targets.{name}", target.sample, step.seq) for name, target in step.targets.items()}
+    return {
+        name: _named(f"targets.{name}", partial(target.sample, rotations.get(name)), step.seq)
+        for name, target in step.targets.items()
+    }
 
 
-def obstacles_of(step: Step, frames: Sequence[bytes]) -> dict[str, Any]:
-    """Return the obstacles of a step; `frames` are those with points.
+def obstacles_of(step: Step, frames: Sequence[bytes], rotations: Mapping[str, Array]) -> dict[str, Any]:
+    """Return the obstacles of a step; `frames` are those with points, `rotations` as in `targets_of`.
 
     Raises:
         Refusal: naming one.
@@ -276,7 +298,7 @@ def obstacles_of(step: Step, frames: Sequence[bytes]) -> dict[str, Any]:
     return {
         name: _named(
             f"obstacles.{name}",
-            update.sample if update.points is None else lambda update=update: update.points_of(frames),
+            partial(update.sample, rotations.get(name)) if update.points is None else partial(update.points_of, frames),
             step.seq,
         )
         for name, update in step.obstacles.items()

@@ -11,11 +11,14 @@ from typing import Any
 import numpy as np
 import zmq
 
+from qpavoid.config import ScenarioConfig
 from qpavoid.controller import Controller
 from qpavoid.errors import ConfigError, QpavoidError
 from qpavoid.model.scene import Obstacle
-from qpavoid.problem import Array, Status
+from qpavoid.problem import Status
+from qpavoid.reason import ReasonKind
 from qpavoid.service import messages
+from qpavoid.service.holding import HeldObstacles, HeldTargets, without_motions
 from qpavoid.service.messages import Fault, Refusal, Request
 
 _QUEUE = 32
@@ -32,10 +35,16 @@ _STANDSTILL = 1e-9
 """Speed from which on a robot stands [rad/s, m/s]."""
 _LONGEST_STOP = 10.0
 """Time for the stop of a robot when the service ends [s]."""
-_HEARTBEAT_LOST: dict[str, Any] = {
-    "kind": "HEARTBEAT_LOST", "subject": [], "amount": None, "unit": "", "severity": "ALARM",
-    "text": "no step came in time: braking, then at rest until a reset",
-}  # fmt: skip
+_STOPS = {
+    "HEARTBEAT_LOST": "no step came in time: braking, then at rest until a reset",
+    "SERVER_ENDS": "the server was asked to end: braking, then at rest; no further command comes",
+}
+"""Kinds of the reason of a stop that no step asked for, in words."""
+
+
+def _stop(kind: str) -> dict[str, Any]:
+    """Return the reason of a stop."""
+    return {"kind": kind, "subject": [], "amount": None, "unit": "", "severity": "ALARM", "text": _STOPS[kind]}
 
 
 class _State(str, Enum):
@@ -44,29 +53,37 @@ class _State(str, Enum):
     RUNNING = "RUNNING"
     """Steps come in time."""
     HALTED = "HALTED"
-    """They did not: braking, then at rest."""
+    """They did not, or the server ends: braking, then at rest."""
 
 
 class Service:
     """A controller behind two sockets: requests, and a stream of commands."""
 
     def __init__(
-        self, controller: Controller, q0: Array, heartbeat: float = 0.1, host: str = "127.0.0.1", port: int = 5570
+        self,
+        scenario: ScenarioConfig,
+        heartbeat: float = 0.1,
+        host: str = "127.0.0.1",
+        port: int = 5570,
+        follows_motions: bool = False,
     ) -> None:
-        """Bind the sockets.
+        """Build the scenario's controller, and bind the sockets.
 
         Args:
-            controller: that answers.
-            q0: configuration (nq,) that clients get to begin at.
+            scenario: whose robot, obstacles and tasks are served.
             heartbeat: time without a step after which the robot is stopped [s].
             host: address of this machine to be reached at.
             port: of requests; that of commands is the next one. 0: any that are free.
+            follows_motions: whether targets and obstacles that a step leaves out move as the scenario has it; else
+                targets are held, and obstacles stand.
 
         Raises:
             ConfigError: an address or port that cannot be had, a heartbeat of less than two control periods.
         """
-        if not 2.0 * controller.dt <= heartbeat <= 10.0:
-            raise ConfigError(f"heartbeat: {heartbeat} s, expected {2.0 * controller.dt:g} (two dt) to 10")
+        scenario = scenario if follows_motions else without_motions(scenario)
+        if not 2.0 * scenario.dt <= heartbeat <= 10.0:
+            raise ConfigError(f"heartbeat: {heartbeat} s, expected {2.0 * scenario.dt:g} (two dt) to 10")
+        controller, q0 = Controller.from_scenario(scenario)
         self._controller, self._q0, self._heartbeat = controller, q0, heartbeat
         self._context = zmq.Context()
         self._requests, self._commands = self._context.socket(zmq.ROUTER), self._context.socket(zmq.PUB)
@@ -84,8 +101,11 @@ class Service:
         self._last, self._next, self._published = 0.0, 0.0, 0
         self._v = np.zeros(controller.scene.robot.model.nv)  # commanded last
         self._counts, self._times = Counter[str](), deque[float](maxlen=_TIMED)
+        self._halts, self._stop = 0, _stop("HEARTBEAT_LOST")
         self._is_ended = False
         robot = controller.scene.robot
+        self._obstacles = HeldObstacles()
+        self._targets = None if follows_motions else HeldTargets(scenario, robot)
         self._description: dict[str, Any] = {
             "qpavoid": version("qpavoid"),
             "robot": robot.name,
@@ -116,15 +136,13 @@ class Service:
         self._is_ended = True
 
     def run(self) -> None:
-        """Answer until `end` is called or Ctrl-C comes; a robot that moves is stopped before."""
-        try:
-            while not self._is_ended:
-                self._turn()
-        except KeyboardInterrupt:
-            pass
+        """Answer until `end` is called; a robot that moves is stopped before."""
+        while not self._is_ended:
+            self._turn()
         end = time.monotonic() + _LONGEST_STOP
         if self.state is _State.RUNNING:
-            self._halt()
+            self._halt("SERVER_ENDS")
+            self._brake(self._next)
         while self._is_moving and time.monotonic() < end:
             self._turn()
 
@@ -141,13 +159,13 @@ class Service:
             self._answer_all()
         now = time.monotonic()
         if self.state is _State.RUNNING and now >= self._last + self._heartbeat:
-            self._halt()
+            self._halt("HEARTBEAT_LOST")
         if self.state is _State.HALTED and now >= self._next:
             self._brake(now)
 
-    def _halt(self) -> None:
+    def _halt(self, why: str) -> None:
         self.state, self._client, self._next = _State.HALTED, b"", time.monotonic()
-        self._counts["HALTED"] += 1
+        self._stop, self._halts = _stop(why), self._halts + 1
 
     def _brake(self, now: float) -> None:
         """Command the next velocity of a stop, or zero.
@@ -161,7 +179,7 @@ class Service:
             fields = messages.command_fields(solution, self._controller.dt)
         fields |= {
             "v": self._v.tolist(), "dt": self._controller.dt, "status": Status.STOPPED.value,
-            "reasons": [_HEARTBEAT_LOST], "stalled": [], "assumptions": [],
+            "reasons": [self._stop], "stalled": [], "assumptions": [],
         }  # fmt: skip
         self._publish(None, fields)
         self._next = max(self._next + self._controller.dt, now)
@@ -214,6 +232,8 @@ class Service:
         if isinstance(request, messages.Hello | messages.Status):
             fields = self._introduction() if isinstance(request, messages.Hello) else self._statistics()
             return messages.pack(request.type, request.seq, **fields)
+        if self._is_ended:
+            raise Refusal(Fault.HALTED, "the server ends", request.seq)
         if self.state is _State.RUNNING and client != self._client:
             raise Refusal(Fault.BUSY, "another client is in control", request.seq)
         try:
@@ -229,12 +249,23 @@ class Service:
             raise Refusal(Fault.HALTED, "steps did not come in time: send a reset", step.seq)
         if step.deadline is not None and time.monotonic() > step.deadline:
             raise Refusal(Fault.LATE, "its deadline has passed", step.seq)
-        targets, obstacles = messages.targets_of(step), messages.obstacles_of(step, clouds)
+        sent = messages.obstacles_of(step, clouds, self._obstacles.rotations)
+        obstacles, last = self._obstacles.complete(sent), self._targets
         q, v = np.array(step.q), None if step.v is None else np.array(step.v)
         if isinstance(step, messages.Filter):
+            messages.targets_of(step, {})  # they play no part, but have to be targets
             solution = self._controller.filter(q, np.array(step.v_desired), step.t, obstacles, v)
+            if last is not None:
+                last.forget()
+        elif last is None or len(q) != len(self._q0):  # the controller refuses that
+            solution = self._controller.step(q, step.t, messages.targets_of(step, {}), obstacles, v)
         else:
-            solution = self._controller.step(q, step.t, targets, obstacles, v)
+            last.begin(q)
+            targets = messages.targets_of(step, last.rotations)
+            solution = self._controller.step(q, step.t, last.complete(targets), obstacles, v)
+            if not any(reason.kind is ReasonKind.IMPLAUSIBLE for reason in solution.reasons):
+                last.keep(targets)
+        self._obstacles.keep(sent)
         self.state, self._client, self._last, self._v = _State.RUNNING, client, time.monotonic(), solution.v
         return self._publish(step.seq, messages.command_fields(solution, self._controller.dt))
 
@@ -249,6 +280,9 @@ class Service:
             case messages.Reset():
                 v = self._v if request.v is None else np.array(request.v)
                 controller.reset(v)
+                self._obstacles.after_reset()
+                if self._targets is not None:
+                    self._targets.forget()
                 self._v, self.state, self._client = v, _State.RUNNING, client
                 self._last = time.monotonic()
                 if not self._is_moving:  # a robot at rest may wait for its first step
@@ -262,8 +296,10 @@ class Service:
                 )  # fmt: skip
             case messages.RemoveObstacle():
                 controller.remove_obstacle(request.name)
+                self._obstacles.drop(request.name)
             case messages.Attach():
                 controller.attach(request.name, request.frame)
+                self._obstacles.drop(request.name)
             case messages.Release():
                 controller.release(request.name)
 
@@ -278,6 +314,7 @@ class Service:
         return {
             "state": self.state.value,
             "counts": dict(self._counts),
+            "halts": self._halts,
             "p50": float(np.median(times)),
             "p99": float(np.percentile(times, 99)),
         }

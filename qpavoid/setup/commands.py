@@ -30,7 +30,9 @@ from qpavoid.setup.texts import description_files, note_lines, summary, write_fi
 _PATIENCE = 2.0
 """Least time between two lines of progress [s]."""
 
-app = typer.Typer(no_args_is_help=True, help="Look a robot over, or describe one for the first time.")
+app = typer.Typer(
+    no_args_is_help=True, rich_markup_mode=None, help="Look a robot over, or describe one for the first time."
+)
 
 ViewIt = Annotated[
     bool, typer.Option("--view", help="Show it in a browser: bodies over meshes, a slider a joint, its pairs.")

@@ -53,34 +53,34 @@ class Hqp(Qp):
         if velocities is None:
             velocities = cascade(problem, least_squares) if problem.levels else problem.v_tracking[None]
         unconstrained = velocities[-1].copy()
-        rows, lower, upper = problem.avoidance, problem.lower, problem.upper
-        if kernels.violation(unconstrained, rows.J, rows.b, lower, upper) <= 0.0:
+        (J, b), (lower, upper) = problem.inequalities, self._bounds(problem)
+        if kernels.violation(unconstrained, J, b, lower, upper) <= 0.0:
             return Solution(unconstrained)
         if not np.isfinite(velocities).all():
             unconstrained = np.zeros_like(unconstrained)
             velocities = np.zeros_like(velocities)
         A = problem.tracking.A
         reduced = [(A[index], A[index] @ v) for index, v in zip(levels, velocities, strict=True)]
-        v, unsolved = self._levels(problem, reduced, unconstrained, rows.b, lower, upper)
+        v, unsolved = self._levels(problem, reduced, unconstrained, J, b, lower, upper)
         if v is not None:
             return Solution(v).with_reasons(*unsolved) if unsolved else Solution(v)
         relaxed = self._relax(problem)
         if isinstance(relaxed, Solution):
             return relaxed
-        slack = np.maximum(rows.b - rows.J @ relaxed, 0.0)
+        slack = np.maximum(b - J @ relaxed, 0.0)
         lower, upper = np.minimum(lower, relaxed), np.maximum(upper, relaxed)
-        v, unsolved = self._levels(problem, reduced, unconstrained, rows.b - slack, lower, upper)
+        v, unsolved = self._levels(problem, reduced, unconstrained, J, b - slack, lower, upper)
         return relaxed_solution(relaxed if v is None else v, problem, *unsolved)
 
     def _levels(
-        self, problem: Problem, levels: Levels, unconstrained: Array, b: Array, lower: Array, upper: Array
+        self, problem: Problem, levels: Levels, unconstrained: Array, J: Array, b: Array, lower: Array, upper: Array
     ) -> tuple[Array | None, tuple[Reason, ...]]:
         """Solve the levels within J v >= b and the bounds, as near to the unconstrained v̂ (nv,) as each leaves it.
 
         Returns:
             Velocity (nv,), None where the first level has no solution; reasons for the levels without one.
         """
-        J, (Z, v), regularization = problem.avoidance.J, _start(problem), self._regularization(problem)
+        (Z, v), regularization = _start(problem), self._regularization(problem)
         is_satisfied, unsolved = False, list[Reason]()
         for level, (A, rate) in enumerate((*levels, (np.eye(len(v)), unconstrained))):
             P = A.T @ A

@@ -8,7 +8,7 @@ from qpavoid import kernels
 from qpavoid.config import HqpSolver, QpSolver
 from qpavoid.problem import Array, Problem, Solution, Status
 from qpavoid.reason import Reason, ReasonKind
-from qpavoid.solvers.backends import make_backend, solve_daqp, verified, within
+from qpavoid.solvers.backends import TOLERANCE, make_backend, solve_daqp, verified, within
 from qpavoid.solvers.relaxation import project, relax, relaxed_solution
 from qpavoid.solvers.solver import NamedSolver
 
@@ -54,17 +54,17 @@ class Qp(NamedSolver):
         """Return the closest safe velocity; relaxed where there is none; a stop where that fails too."""
         if problem.violation <= 0.0:
             return Solution(problem.v_tracking.copy())
-        A, rows, lower, upper = problem.tracking.A, problem.avoidance, problem.lower, problem.upper
+        A, (J, b), (lower, upper) = problem.tracking.A, problem.inequalities, self._bounds(problem)
         regularization, v_tracking, contacts = self._regularization(problem), problem.v_tracking, problem.contacts
         if self._native and contacts is None:
-            v, solved = kernels.project(A, regularization, v_tracking, rows.J, rows.b, lower, upper)
+            v, solved = kernels.project(A, regularization, v_tracking, J, b, lower, upper)
             if solved:
                 return Solution(v)
         P, q = kernels.projection_cost(A, regularization, v_tracking)
         for backend in self._backends:
             if contacts is not None:
                 backend = within(backend, contacts.Z, contacts.v_particular)
-            answer = verified(backend, P, q, rows.J, rows.b, lower, upper)
+            answer = verified(backend, P, q, J, b, lower, upper)
             if answer is not None:
                 return Solution(answer)
         relaxed = self._relax(problem)
@@ -73,6 +73,19 @@ class Qp(NamedSolver):
     def _regularization(self, problem: Problem) -> float:
         """Return λ of this control step."""
         return max(float(self.config.regularization), problem.bent)
+
+    def _bounds(self, problem: Problem) -> tuple[Array, Array]:
+        """Return the bounds (nv,), (nv,); at the torque level, with accelerations passed as little as rows need."""
+        lower, upper, hard = problem.lower, problem.upper, (problem.hard_lower, problem.hard_upper)
+        if problem.dynamics is None or not problem.dynamics.torque_rows or problem.contacts is not None:
+            return lower, upper
+        A, regularization = problem.tracking.A, self._regularization(problem)
+        rows = problem.inequalities
+        v, solved = kernels.project_widened(A, regularization, problem.v_tracking, *rows, lower, upper, *hard)
+        if not solved:
+            return lower, upper
+        lower, upper = np.minimum(lower, v - TOLERANCE), np.maximum(upper, v + TOLERANCE)
+        return np.maximum(lower, hard[0]), np.minimum(upper, hard[1])
 
     def low_effort(self, problem: Problem, slack: Array | None) -> Array | None:
         """Compute a solution with the same slacks and bounds that weighs joint speeds as much as the task's.

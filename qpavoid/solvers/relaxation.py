@@ -11,7 +11,6 @@ code, for slacks that are no larger than necessary.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from functools import partial
 
 import numpy as np
@@ -20,6 +19,7 @@ from qpavoid import kernels
 from qpavoid.problem import Array, AvoidanceRows, IntArray, Problem, Solution, Status
 from qpavoid.reason import Reason, ReasonKind, Severity
 from qpavoid.solvers.backends import TOLERANCE, reduced_rows
+from qpavoid.solvers.holding import Bounds, Closest, dynamics_reasons, loosened_holding
 
 _LEVEL_WIDTH = 2e-3
 """Difference of distances below which rows are of one level, whose slacks are shared [m]: pairs of one contact."""
@@ -32,11 +32,6 @@ _MIN_RELAXATION = 5.0 * TOLERANCE
 _CONTACT_TOLERANCE = 1e-5
 """Violation of a row without a margin from which contact is predicted [m/s]: above what those tolerances add up to."""
 
-Bounds = tuple[Array, Array]
-"""Lower and upper bound (nv,) on v [rad/s or m/s]."""
-Closest = Callable[..., "Array | None"]
-"""(J, b, lower, upper, soft) -> velocity; see `_closest`."""
-
 
 def relax(problem: Problem, regularization: float) -> Array | None:
     """Compute the velocity (nv,) of least violations, in the order of this module.
@@ -48,15 +43,21 @@ def relax(problem: Problem, regularization: float) -> Array | None:
     Returns:
         The velocity; None where a QP fails.
     """
-    rows, bounds = problem.avoidance, (problem.lower, problem.upper)
+    rows, bounds, dynamics = problem.avoidance, (problem.lower, problem.upper), problem.dynamics
+    if dynamics is not None:  # torques first, then contact, then holding, then margins
+        problem = problem._replace(dynamics=dynamics.with_holding(dynamics.b[:0]))
+        bounds = (problem.hard_lower, problem.hard_upper) if dynamics.torque_rows else bounds
     closest, no_floor = partial(_closest, problem, regularization), np.full(len(rows.d), -np.inf)
     b_contact = rows.b_contact - TOLERANCE
-    if problem.hard_lower is not problem.lower and closest(rows.J, b_contact, *bounds) is None:
+    if bounds[0] is not problem.hard_lower and closest(rows.J, b_contact, *bounds) is None:
         hard = problem.hard_lower, problem.hard_upper
         b_contact = b_contact - _lexicographic_slack(rows, b_contact, no_floor, hard, closest)[0]
         bounds = _widened_bounds(problem, b_contact, closest)
     slack, first = _lexicographic_slack(rows, b_contact, no_floor, bounds, closest)
     b_contact = b_contact - slack
+    if dynamics is not None:
+        problem = problem._replace(dynamics=loosened_holding(dynamics, rows.J, b_contact, bounds, closest))
+        closest = partial(_closest, problem, regularization)
     slack, second = _lexicographic_slack(rows, rows.b, b_contact, bounds, closest)
     final = closest(rows.J, np.maximum(b_contact, rows.b - slack) - TOLERANCE, *bounds)
     # an earlier one violates a little more, where round-off prevents a later one
@@ -67,7 +68,9 @@ def project(
     problem: Problem, A: Array, regularization: float, J: Array, b: Array, lower: Array, upper: Array,
     soft: Array | None = None,
 ) -> Array | None:  # fmt: skip
-    """Compute the velocity (nv,) closest to tracking that meets rows, bounds and contacts; see `kernels.project_soft`.
+    """Compute the velocity (nv,) closest to tracking that meets rows, bounds, contacts and the rows of the dynamics.
+
+    See `kernels.project_soft`.
 
     Args:
         problem: with v_tracking and contacts.
@@ -84,6 +87,9 @@ def project(
     """
     v_tracking, contacts = problem.v_tracking, problem.contacts
     soft = np.zeros(len(b)) if soft is None else soft
+    if (dynamics := problem.dynamics) is not None:
+        J, b = np.concatenate((J, dynamics.J)), np.concatenate((b, dynamics.b))
+        soft = np.concatenate((soft, np.zeros(len(dynamics.b))))
     if contacts is None:
         v, solved = kernels.project_soft(A, regularization, v_tracking, J, b, lower, upper, soft)
         return v if solved else None
@@ -196,7 +202,8 @@ def relaxed_solution(v: Array, problem: Problem, *reasons: Reason) -> Solution:
         Reason.of(kind, names[j], amount=float(excess[j]), unit=f"{units[j]}/s")
         for j in np.flatnonzero(excess > _MIN_RELAXATION).tolist()
     ]
-    reasons = (*relaxed, *passed, *_limiting_joints(rows.J[violated], v, problem, worst), *reasons)
+    limiting = _limiting_joints(rows.J[violated], v, problem, worst)
+    reasons = (*relaxed, *passed, *limiting, *dynamics_reasons(v, problem, worst), *reasons)
     if not reasons:
         return Solution(np.clip(v, problem.lower, problem.upper))
     return Solution(v, Status.RELAXED, reasons, slack if slack.any() else None)

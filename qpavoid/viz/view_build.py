@@ -45,15 +45,25 @@ def build_runs(name: str, sets: Sequence[str], solvers: Sequence[str | None], re
     Raises:
         ConfigError, UnknownName, SolverNotInstalled: it cannot be built.
     """
-    configs, controllers, q0 = [], [], np.zeros(0)
+    configs = configs_of(name, sets, solvers, removed)
+    controllers, q0 = [], np.zeros(0)
+    for config in configs:
+        controller, q0 = Controller.from_scenario(config)
+        controllers.append(controller)
+    return Runs(configs[0], q0, controllers)
+
+
+def configs_of(
+    name: str, sets: Sequence[str], solvers: Sequence[str | None], removed: set[str]
+) -> list[ScenarioConfig]:
+    """Return the configurations of these controllers; see `build_runs`."""
+    configs = []
     for solver in solvers:
         config = load_scenario(name, sets, solver)
         present = [obstacle for obstacle in config.obstacles if obstacle.name not in removed]
         changes = {"obstacles": present, "spare_obstacles": max(config.spare_obstacles, _SPARE)}
         configs.append(config.model_copy(update=changes).with_source(config.source))
-        controller, q0 = Controller.from_scenario(configs[-1])
-        controllers.append(controller)
-    return Runs(configs[0], q0, controllers)
+    return configs
 
 
 class Build(Thread):

@@ -6,9 +6,9 @@ from collections.abc import Callable
 from typing import Any
 
 from qpavoid.viz.view_ghosts import COLOURS
-from qpavoid.viz.view_link import Frame, PageSetup
+from qpavoid.viz.view_link import BACKUP, Frame, PageSetup
 from qpavoid.viz.view_plots import Plots
-from qpavoid.viz.view_status import legend_html, text_html
+from qpavoid.viz.view_status import hint_html, legend_html, text_html
 
 _PERIOD = 6
 """Frames between two updates of plots and status."""
@@ -23,6 +23,8 @@ class Controls:
         server.gui.configure_theme(dark_mode=False, control_layout="collapsible", show_share_button=False)
         server.gui.set_panel_label(setup.title)
         self._status = server.gui.add_html(text_html("waiting for the loop"))
+        if "hint" in setup.controls:
+            server.gui.add_html(hint_html(setup.controls["hint"]))
         self._resets: list[Callable[[], None]] = []
         self._time: Any = None
         self._removable: Any = None
@@ -33,8 +35,7 @@ class Controls:
             self._add_laws(values)
         if "joints" in values:
             self._add_joints(values["joints"])
-        if setup.others:
-            server.gui.add_html(legend_html(setup.others, COLOURS[1 : 1 + len(setup.others)]))
+        self._legend = server.gui.add_html("") if setup.others else None
         self._plots = Plots(server.gui, setup) if "joints" not in values else None
         if "shapes" in values:
             self._add_obstacles(values["shapes"])
@@ -45,6 +46,10 @@ class Controls:
             with server.gui.add_folder(title, expand_by_default=False):
                 server.gui.add_html(text)
         self._count = 0
+
+    def wait(self, text: str) -> None:
+        """Say what is waited for, in plain text."""
+        self._status.content = text_html(text)
 
     def on_body_toggle(self, show: Callable[[bool], None]) -> None:
         """Call something with whether the collision bodies shall be visible, whenever that changes."""
@@ -124,7 +129,6 @@ class Controls:
     def _add_obstacles(self, shapes: tuple[str, ...]) -> None:
         gui = self._gui
         with gui.add_folder("obstacles"):
-            gui.add_html(text_html("Drag them with the mouse, and targets by their arrows."))
             shape = gui.add_dropdown("shape", shapes, initial_value=shapes[0])
             size = gui.add_slider("size [mm]", 20.0, 400.0, 10.0, 120.0)
             add = gui.add_button("add")
@@ -155,6 +159,11 @@ class Controls:
         self._count += 1
         if self._count % _PERIOD:
             return
+        if self._legend is not None:
+            count = int(frame.ghosts[:, 0].max(initial=BACKUP))
+            legend = legend_html(self._setup.others[:count], COLOURS[1 : 1 + count])
+            if self._legend.content != legend:
+                self._legend.content = legend
         if self._status.content != frame.text:
             self._status.content = frame.text
         if self._time is not None and abs(self._time.value - frame.t) > 1e-9:

@@ -5,7 +5,8 @@ from __future__ import annotations
 import json
 import pickle
 import socket
-from collections.abc import Iterator
+import struct
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
@@ -14,6 +15,8 @@ from typing import Any, NamedTuple
 import numpy as np
 import pinocchio as pin
 
+from qpavoid.config import Avoidance
+from qpavoid.control.tasks import RowTask, in_order
 from qpavoid.control.tick import Tick
 from qpavoid.errors import ConfigError
 from qpavoid.model.robot import Robot
@@ -59,7 +62,7 @@ class Frame(NamedTuple):
     touching: Array
     """(b,) numbers of the robot's bodies that touch something."""
     text: str = ""
-    """Status, in HTML."""
+    """Status, in HTML; empty where it is the one before."""
 
 
 @dataclass
@@ -93,6 +96,8 @@ class PageSetup:
     """Frames shown, at most [1/s]."""
     quality: str = "high"
     """`high`, or `low` for machines without a graphics processor."""
+    waiting: str = ""
+    """What is shown, with the seconds that have gone by, until the first frame has a status; in plain text."""
     parent: int = 0
     """Process whose end ends the page."""
 
@@ -157,7 +162,9 @@ def frame_of(tick: Tick, robot: Robot, obstacle_of_pair: IntArray, text: str = "
     near, closest = tick.problem.avoidance, tick.proximity.closest
     # the gains take distances with an offset, the same of all pairs but for those with a safety distance of their own
     offset = float(np.sort(near.d - closest[:, 0])[len(closest) // 2]) if 0 < len(near.d) == len(closest) else 0.0
-    witnesses: Array = np.column_stack((closest[:, [0, 4, 5, 6, 7, 8, 9]], obstacle_of_pair[tick.proximity.pair]))
+    witnesses: Array = np.empty((len(closest), 8))
+    witnesses[:, 0], witnesses[:, 1:7] = closest[:, 0], closest[:, 4:10]
+    witnesses[:, 7] = obstacle_of_pair[tick.proximity.pair]
     if len(witnesses) > MAX_WITNESSES:
         witnesses = witnesses[np.argsort(witnesses[:, 0])[:MAX_WITNESSES]]
     tools = tick.kinematics.position
@@ -179,6 +186,16 @@ def frame_of(tick: Tick, robot: Robot, obstacle_of_pair: IntArray, text: str = "
 _NONE = np.zeros(0)
 
 
+def still_frame(scene: Scene, tasks: Sequence[RowTask], q: Array, avoidance: Avoidance) -> Frame:
+    """Return what is shown before there is a control step: the scene at t = 0, and no status."""
+    targets = [task.motion.sample(0.0).row[:12] for task in in_order(tasks)[0]]
+    obstacles = [obstacle.motion.sample(0.0).row[:12] for obstacle in scene.slots]
+    return Frame(
+        0.0, q, np.zeros(scene.robot.model.nv), np.zeros((0, 8)), np.zeros((0, 3)), np.reshape(targets, (-1, 12)),
+        np.reshape(obstacles, (-1, 12)), np.array([avoidance.d1, avoidance.d2]), np.empty((0, 2 + len(q))), _NONE,
+    )  # fmt: skip
+
+
 def obstacles_of_pairs(scene: Scene) -> IntArray:
     """Return the number of the obstacle of each pair (m,), -1 between two bodies of the robot."""
     return np.asarray(scene.obstacle_of[scene.pairs].max(axis=1, initial=-1))
@@ -197,9 +214,9 @@ _FRAME, _CHANGE = b"f", b"c"
 
 def pack(frame: Frame) -> bytes:
     """Return a frame as a datagram."""
-    parts = [np.ravel(part) for part in frame[1:10]]
-    numbers = np.concatenate([(frame.t, *map(len, parts)), *parts])
-    return _FRAME + bytes(numbers.tobytes()) + frame.text.encode()
+    parts = frame[1:10]
+    header = struct.pack(f"{_HEADER}d", frame.t, *(part.size for part in parts))
+    return b"".join((_FRAME, header, *(part.tobytes() for part in parts), frame.text.encode()))
 
 
 def pack_change(change: SlotChange) -> bytes:

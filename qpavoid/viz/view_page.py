@@ -29,6 +29,12 @@ _GAP = 1.0
 _STILL = 1e-3
 """Extent of a planned path that is not drawn [m]."""
 _PLANNED, _TOUCHING = (120, 90, 170), (220, 30, 30)
+_NARROW = 0.8
+"""Width of the picture in heights below which it is looked at from farther away [-]."""
+_NAMED, _ABOVE = 6, 0.04
+"""Obstacles whose names are written above them, at most, and how far above [m]."""
+_SWELL = 2e-3
+"""By how much collision bodies are drawn larger than they are [m]."""
 _FEW_FACES = 1500
 _COARSE = 0.012
 """Size of details that are left out where the quality is low [m]."""
@@ -45,6 +51,13 @@ class Page:
         scene.set_up_direction("+z")
         scene.add_grid("/grid", 6.0, 6.0, cell_size=0.25)
         server.initial_camera.position, server.initial_camera.look_at = setup.camera
+
+        @server.on_client_connect  # type: ignore[untyped-decorator]
+        async def _(client: Any) -> None:
+            if client.camera.aspect < _NARROW:  # so that what is seen in other windows is not cut off at the sides
+                position, look_at = setup.camera
+                client.camera.position = look_at + (position - look_at) * _NARROW / client.camera.aspect
+
         if setup.quality == "low":
             scene.configure_default_lights(True, cast_shadow=False)
             scene.configure_environment_map(None)
@@ -58,7 +71,7 @@ class Page:
             self._add_part(f"/robot/{name}", joint, placement, meshes)
         self._bodies = scene.add_frame("/bodies", show_axes=False, visible=not visuals)
         self._body_meshes = [
-            self._add_part(f"/bodies/{number}", joint, placement, [mesh])[0]
+            self._add_part(f"/bodies/{number}", joint, placement, [_swollen(mesh) if visuals else mesh])[0]
             for number, (joint, placement, mesh) in enumerate(setup.bodies)
         ]
         self._touching: set[int] = set()
@@ -118,6 +131,7 @@ class Page:
         node = self._obstacles[change.slot][1]
         if self._obstacles[change.slot][0]:
             self.server.scene.remove_by_name(f"/obstacles/{change.slot}/shape")
+            self.server.scene.remove_by_name(f"/obstacles/{change.slot}/name")
         self._obstacles[change.slot] = change.name, node
         if change.name and len(change.mesh.faces):
             self._add_obstacle(change.slot, change.name, change.mesh)
@@ -161,6 +175,9 @@ class Page:
                 )
 
         shape.on_drag(drag)
+        if len(self.obstacle_names) <= _NAMED:
+            top = np.array([0.0, 0.0, mesh.vertices[:, 2].max() + _ABOVE])
+            self.server.scene.add_label(f"/obstacles/{index}/name", name, position=top)
 
     def _add_target(self, name: str, can_turn: bool) -> Any:
         gizmo = self.server.scene.add_transform_controls(
@@ -215,6 +232,13 @@ class Page:
             self._trace.points = segments
         if self._trace.visible != is_visible:
             self._trace.visible = is_visible
+
+
+def _swollen(mesh: Mesh) -> Mesh:
+    """Return a convex mesh that is a little larger: where it would lie in the surface of another one, it flickers."""
+    outward = mesh.vertices - mesh.vertices.mean(axis=0)
+    length = np.linalg.norm(outward, axis=1, keepdims=True)
+    return mesh._replace(vertices=(mesh.vertices + _SWELL * outward / np.maximum(length, 1e-9)).astype(np.float32))
 
 
 def _bytes(colour: tuple[float, ...]) -> tuple[int, int, int]:

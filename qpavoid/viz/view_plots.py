@@ -30,6 +30,7 @@ class Plots:
         from viser import uplot
 
         self._gui, self._uplot, self._setup, self._obstacles = gui, uplot, setup, list[tuple[int, str]]()
+        self._has_others = False  # whether another run was shown yet
         self._has_many = len(setup.joint_names) > _MAX_LINES
         names = ["fastest joint"] if self._has_many else setup.joint_names
         speeds = [(name, COLOURS[i % len(COLOURS)]) for i, name in enumerate(names)] + [("limit", _LIMIT)]
@@ -49,11 +50,16 @@ class Plots:
         )
 
     def _distance_lines(self) -> list[tuple[str, str]]:
-        others = [(name, _hex(GHOSTS[(1 + i) % len(GHOSTS)])) for i, name in enumerate(self._setup.others)]
+        others = [(name, _hex(GHOSTS[(1 + i) % len(GHOSTS)])) for i, name in enumerate(self._others)]
         obstacles = [
             (name, _hex(255.0 * np.array(OBSTACLES[slot % len(OBSTACLES)]))) for slot, name in self._obstacles
         ]  # fmt: skip
         return [("d1", _D1), ("d2", _D2), ("itself", _ITSELF), *others, *obstacles]
+
+    @property
+    def _others(self) -> list[str]:
+        """Names of the other runs, once there are some."""
+        return self._setup.others if self._has_others else []
 
     def name_obstacles(self, names: list[tuple[int, str]]) -> None:
         """Draw a line for each obstacle, of a slot and a name: of the first ones that there were.
@@ -65,8 +71,11 @@ class Plots:
         lines = [(slots.pop(name, _GONE), name) for _, name in self._obstacles]
         new = [(slot, name) for name, slot in slots.items()][: _MAX_LINES - len(lines)]
         self._obstacles = [*lines, *new]
-        if not new:
-            return
+        if new:
+            self._renew_distances()
+
+    def _renew_distances(self) -> None:
+        """Plot other lines from now on."""
         self.clear()
         order = self._plots[0].order
         self._plots[0].remove()  # the browser does not take other lines into a plot that it has
@@ -83,9 +92,12 @@ class Plots:
             self.clear()
         if self._times and frame.t <= self._times[-1]:
             return
+        if not self._has_others and (frame.ghosts[:, 0] > BACKUP).any():
+            self._has_others = True
+            self._renew_distances()
         witnesses, percent = frame.witnesses, 100.0 * np.abs(frame.v) / self._setup.speed_limits
         beyond = frame.levels[1]  # of what is farther away than d2, which is not computed
-        others = np.full(len(self._setup.others), beyond)
+        others = np.full(len(self._others), beyond)
         for kind, distance in frame.ghosts[:, :2]:
             if kind > BACKUP:
                 others[int(kind) - 1] = min(distance, beyond)

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from qpavoid.config import ScenarioConfig
+from qpavoid.control.scenario import build_parts
 from qpavoid.control.tasks import in_order
 from qpavoid.control.tick import Tick
 from qpavoid.controller import Controller
@@ -17,10 +18,10 @@ from qpavoid.model.scene import Obstacle
 from qpavoid.problem import Array
 from qpavoid.solvers import SOLVERS
 from qpavoid.viz.view import View, page_setup, pose_of, run_page
-from qpavoid.viz.view_build import SHAPES, Build, Loop, Runs, build_runs, shape_of
+from qpavoid.viz.view_build import SHAPES, Build, Loop, Runs, build_runs, configs_of, shape_of
 from qpavoid.viz.view_clock import SPEEDS, PlayClock
 from qpavoid.viz.view_drag import Pulled
-from qpavoid.viz.view_link import Frame
+from qpavoid.viz.view_link import Frame, still_frame
 
 ROWS = ("beta", "task-switching")
 """Row forms that a page offers."""
@@ -31,6 +32,8 @@ LOOK_BACK = 30.0
 _RATE = 30.0
 """Frames a second."""
 _PLANNED_POINTS = 300
+_HINT = "Drag {} into the robot with the mouse: it steps aside. Pull its target by the arrows."
+_WAITING = "The robot moves once its controller is built (the first time on a machine: a minute or two of compiling)"
 
 
 class Session:
@@ -68,7 +71,12 @@ class Session:
         self.loops: list[Loop] = []
         """The robot that is shown in full, then the one beside it, if there is one."""
         self._obstacles: dict[str, Pulled] = {}
-        self._take(build_runs(*self._build_arguments()))
+        self.view = self._open_page(port, host, quality)
+        try:
+            self._take(build_runs(*self._build_arguments()))
+        except BaseException:
+            self.view.close()
+            raise
         self._labels = [task.settings.label for task in self.controller.tasks]
         self.clock = PlayClock(self.config.dt)
         self._build: Build | None = None
@@ -77,17 +85,26 @@ class Session:
         """Time of what the page shows, which is in the past while it looks back [s]."""
         self._history: deque[Frame] = deque(maxlen=round(LOOK_BACK * _RATE))
         self._restart()
-        frames = in_order(self.controller.tasks)[0]
-        targets = [(task.settings.label, task.turns) for task in frames]
-        scene = self.controller.scene
-        title = self.config.title or self.config.source.stem
-        times = np.linspace(0.0, self.config.duration, _PLANNED_POINTS)
+        self.view.scene = self.controller.scene
+
+    def _open_page(self, port: int, host: str, quality: str) -> View:
+        """Start the page, which shows the scene while the controller is built."""
+        config = configs_of(*self._build_arguments())[0]
+        parts = build_parts(config)
+        frames, scene, q0 = in_order(parts.tasks)[0], parts.scene, parts.q0
+        times = np.linspace(0.0, config.duration, _PLANNED_POINTS)
         planned = [np.array([task.motion.sample(t).position for t in times]) for task in frames if task.moves]
-        setup = page_setup(scene.robot, [], targets, title, self._q0, planned)
-        setup.controls = _controls(self.config, self._beside)
-        setup.others = ["beside"]
+        nearby = np.array(
+            [o.motion.sample(t).position for o in scene.slots if o.name for t in times[:: len(times) // 10]]
+        )
+        targets = [(task.settings.label, task.turns) for task in frames]
+        setup = page_setup(scene.robot, [], targets, config.title or config.source.stem, q0, planned, nearby)
+        setup.controls = _controls(config, self._beside, [o.name for o in config.obstacles])
+        setup.others, setup.waiting = ["beside"], _WAITING
         setup.port, setup.host, setup.quality, setup.rate = port, host, quality, _RATE
-        self.view = View.of_setup(setup, scene)
+        view = View.of_setup(setup, scene)
+        view.show(still_frame(scene, parts.tasks, q0, config.avoidance))
+        return view
 
     @property
     def controller(self) -> Controller:
@@ -286,11 +303,12 @@ class Session:
                 self.loops[number].tick = loops_now[0].tick if loops_now else None
 
 
-def _controls(config: ScenarioConfig, beside: str) -> dict[str, Any]:
+def _controls(config: ScenarioConfig, beside: str, obstacles: Sequence[str]) -> dict[str, Any]:
     """Return choices and values of the controls of a scenario's page."""
     solver, row = config.solver.label, config.avoidance.row.type
     solvers = tuple(dict.fromkeys([solver, *SOLVERS]))
     return {
+        "hint": _HINT.format(f"the {obstacles[0]}" if obstacles else "an obstacle, added below,"),
         "speeds": SPEEDS,
         "solvers": solvers,
         "solver": solver,

@@ -56,6 +56,11 @@ def text_html(*lines: str) -> str:
     return _PAGE.format("<br>".join(map(escape, lines)))
 
 
+def hint_html(text: str) -> str:
+    """Return what is to be done first, in plain text."""
+    return _PAGE.format(f'<b style="color:#0B5CAD">{escape(text)}</b>')
+
+
 def closest_html(a: str, b: str, distance: float, d1: float) -> str:
     """Return the closest pair and its distance [m]."""
     colour = "#C62F2F" if distance < 0.0 else "#9C5F00" if distance < d1 else "#333333"
@@ -68,7 +73,12 @@ def times_html(step_times: Sequence[float]) -> str:
         return ""
     ordered = sorted(step_times)  # a quarter of the time of numpy's quantiles
     median, p99 = ordered[len(ordered) // 2], ordered[int(0.99 * (len(ordered) - 1))]
-    return f", step {1e3 * median:.2g} ms, p99 {1e3 * p99:.2g} ms"
+    return f", step {_milliseconds(median)}, p99 {_milliseconds(p99)}"
+
+
+def _milliseconds(time: float) -> str:
+    """Return a time [s] in words: 0.31 ms, 1.4 ms, 12 ms, 120 ms."""
+    return f"{1e3 * time:.2g} ms" if time < 0.0995 else f"{1e3 * time:.0f} ms"
 
 
 def legend_html(names: Sequence[str], colours: Any) -> str:

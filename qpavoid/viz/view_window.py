@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 import os
 import pickle
-import select
 import signal
 import socket
 import sys
@@ -18,8 +17,6 @@ from qpavoid.viz.view_page import Page
 
 _NICE = 5
 """How much less urgent than the loop the page is."""
-_PATIENCE = 0.2
-"""Longest time between two looks at whether the loop is still there [s]."""
 
 
 def main(descriptor: int, path: str) -> None:
@@ -69,24 +66,30 @@ def build(setup: PageSetup, link: socket.socket) -> tuple[Page, Controls, str]:
 
 def serve(setup: PageSetup, link: socket.socket, page: Page, controls: Controls) -> None:
     """Show the newest frame, again and again, while the loop's process runs."""
-    clients = 0
+    text = ""
+    clients, start, is_waiting = 0, time.perf_counter(), bool(setup.waiting)
     while os.getppid() == setup.parent:
-        select.select([link], [], [], _PATIENCE)
         begin, newest = time.perf_counter(), None
         for datagram in received(link):
             if isinstance(item := unpack(datagram), SlotChange):
                 page.change(item)
                 controls.name_obstacles(page.obstacle_names)
             else:
-                newest = item
+                newest, text = item, item.text or text
         count = len(page.server.get_clients())
         if count != clients and send_event(link, type="clients", count=count):
             clients = count
+        if is_waiting:
+            is_waiting = newest is None or not newest.text
+            controls.wait(f"{setup.waiting}: {time.perf_counter() - start:.0f} s")
         if newest is not None:
+            newest = newest._replace(text=text)
             with page.server.atomic():
                 page.show(newest)
                 controls.show(newest)
-        time.sleep(max(0.0, 1.0 / setup.rate - (time.perf_counter() - begin)))
+        time.sleep(
+            max(0.0, 1.0 / setup.rate - (time.perf_counter() - begin))
+        )  # frames do not wake it, in the loop's time
 
 
 if __name__ == "__main__":

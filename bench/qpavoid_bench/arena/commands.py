@@ -1,4 +1,4 @@
-"""`qpavoid bench run | smoke | report | show | list | tick | solvers | endurance | robots | grasps | serve | camera`.
+"""The commands of `qpavoid bench`.
 
 Dependencies of a command are imported when it runs.
 """
@@ -17,6 +17,7 @@ from qpavoid.config.shipped import shipped_names
 from qpavoid.errors import ConfigError
 from qpavoid.run.report import to_json
 from qpavoid.run.terminal import ERR, OUT, names_of, progress, terminate_like_interrupt
+from qpavoid_bench.adapters import adapters
 from qpavoid_bench.camera import camera
 from qpavoid_bench.endurance.command import endurance
 from qpavoid_bench.grasps.command import grasps
@@ -36,6 +37,7 @@ app = typer.Typer(
     add_completion=False,
     no_args_is_help=True,
     pretty_exceptions_enable=False,
+    rich_markup_mode=None,  # which takes units in brackets for markup
     help="Compare solvers on families of scenarios: the arena.",
 )
 
@@ -45,8 +47,9 @@ app.command()(endurance)
 app.command()(robots)
 app.command()(serve)
 app.command()(camera)
+app.command()(adapters)
 app.command()(grasps)
-_MEASURES = ("tick", "solvers", "endurance", "robots", "grasps", "serve", "camera")
+_MEASURES = ("tick", "solvers", "endurance", "robots", "grasps", "serve", "camera", "adapters")
 """Commands that need none of the packages below."""
 
 _PACKAGES = ("distributed", "mujoco", "pandas", "statsmodels", "matplotlib")

@@ -22,8 +22,6 @@ SAMPLES = 20
 
 def latency(workload: str, count: int) -> dict[str, Any]:
     """Time every step of a closed loop, and of a loop that only reads the clock and takes as long as the median."""
-    from qpavoid_bench.tick.loops import LAP
-
     loop = _warm(workload)
     ns = np.zeros(count, dtype=np.int64)
     switches = _switches()
@@ -33,7 +31,9 @@ def latency(workload: str, count: int) -> dict[str, Any]:
         ns[k] = perf_counter_ns() - begin
         loop.advance(v)
     switches = _switches() - switches
-    work = np.median(ns[: count // LAP * LAP].reshape(-1, LAP), axis=0)  # of each step of a lap, over all laps
+    work = np.median(
+        ns[: count // loop.lap * loop.lap].reshape(-1, loop.lap), axis=0
+    )  # of each step of a lap, over all laps
     machine = _spin(float(np.median(ns)), count)
     return {
         "steps": _quantiles(ns),
@@ -170,10 +170,10 @@ def throughput(scenario: str, runs: int, states: int, processes: int) -> dict[st
 
 
 def _warm(workload: str) -> Any:
-    from qpavoid_bench.tick.loops import LAP, make_loop
+    from qpavoid_bench.tick.loops import make_loop
 
     loop = make_loop(workload)
-    _run(loop, LAP)
+    _run(loop, loop.lap)
     gc.collect()
     return loop
 

@@ -24,9 +24,12 @@ def grasps(
     robot: Annotated[
         list[str] | None, typer.Option(metavar="NAME=ROBOT", help="Another robot.yaml for a robot of the set.")
     ] = None,
+    every: Annotated[int, typer.Option(min=1, help="Every how many problems one is run in closed loop.")] = 1,
     out: Annotated[Path, typer.Option(help="Folder of the results.")] = RESULTS,
 ) -> None:
-    """Measure how clear the bodies of the shipped robots are at the grasps of MotionBenchMaker."""
+    """Measure bodies, paths and closed loops at the grasps of MotionBenchMaker: clearances, times, goals reached."""
+    from qpavoid_bench.grasps.closed_loop_report import closed_loop_sections, rows_of, run_with_all
+
     robots = dict(text.partition("=")[::2] for text in robot or ())
     if not all(robots.values()):
         raise ConfigError("--robot: expected NAME=ROBOT, as in panda=my/robot.yaml")
@@ -34,7 +37,9 @@ def grasps(
     for problem in problems[:1]:
         plan(problem)  # compiles the planner
     measured = [(problem, *measure(problem), plan(problem)) for problem in problems]
-    print(write(out, "grasps", _sections(measured)))
+    reached = [(problem, run_with_all(problem)) for problem in problems[::every]]
+    sections = (*_sections(measured), *closed_loop_sections(reached))
+    print(write(out, "grasps", sections, [row for problem, results in reached for row in rows_of(problem, results)]))
 
 
 def _sections(measured: Sequence[Measured]) -> Iterator[str]:
@@ -60,9 +65,10 @@ def _sections(measured: Sequence[Measured]) -> Iterator[str]:
     yield "## Paths"
     yield (
         f"`plan_to` from the start to the goal configuration, {1e3 * REQUIRED:g} mm from everything. Times are of the "
-        "processor, on one thread, for the plan alone; `of clear`: of the problems with a clear start and goal."
+        "processor, on one thread, for the plan alone; `of clear`: of the problems with a clear start and goal. "
+        "`more`: what the median path keeps beyond that; `by coal`: the least that any of them has, by coal alone."
     )
-    head = ["family", "problems", "paths", "of clear", "p50 [ms]", "p90 [ms]", "max [ms]", "more than required [mm]"]
+    head = ["family", "problems", "paths", "of clear", "p50 [ms]", "p90 [ms]", "max [ms]", "more [mm]", "by coal [mm]"]
     paths = [_paths(family, [entry for entry in measured if entry[0].family == family]) for family in families]
     yield table(head, [*paths, _paths("all", measured)])
     without = [
@@ -84,6 +90,7 @@ def _paths(name: str, measured: Sequence[Measured]) -> list[object]:
         f"{sum(path.is_complete for path in clear)}/{len(clear)}",
         *(number(float(np.quantile(times, fraction))) for fraction in (0.5, 0.9, 1.0)),
         number(float(np.median(clearances)) if clearances else np.nan),
+        number(1e3 * min((path.by_coal for path in plans if path.is_complete), default=np.nan)),
     ]  # fmt: skip
 
 

@@ -35,6 +35,8 @@ class Problem:
     """Its number in the family."""
     robot: Robot
     """Joints that it locks, such as those of fingers, stay where it locks them."""
+    robot_name: str
+    """Shipped name of the robot, or the path of its robot.yaml."""
     obstacles: tuple[Obstacle, ...]
     """All of them stand still."""
     q_start: Array
@@ -80,9 +82,10 @@ def load_problems(path: str | Path = FOLDER, robots: Mapping[str, str | Path] | 
         raise ConfigError(f"{path}: there is no such problem set; name its folder with --data")
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
-        loaded = {name: Robot.load((robots or {}).get(name, name)) for name in content}
+        sources = {name: str((robots or {}).get(name, name)) for name in content}
+        loaded = {name: Robot.load(source) for name, source in sources.items()}
         return [
-            _problem(f"{name}/{kind}", entry, loaded[name])
+            _problem(f"{name}/{kind}", entry, loaded[name], sources[name])
             for name, kinds in content.items()
             for kind, entries in kinds.items()
             for entry in entries
@@ -91,7 +94,7 @@ def load_problems(path: str | Path = FOLDER, robots: Mapping[str, str | Path] | 
         raise ConfigError(f"{path}: not a problem set: {fault!r:.100}") from None
 
 
-def _problem(family: str, entry: Mapping[str, Any], robot: Robot) -> Problem:
+def _problem(family: str, entry: Mapping[str, Any], robot: Robot, robot_name: str) -> Problem:
     obstacles = tuple(
         Obstacle.at(fields["name"], _shape(fields["shape"]), fields["position"], pin.rpy.rpyToMatrix(*fields["rpy"]))
         for fields in entry["obstacles"]
@@ -100,7 +103,7 @@ def _problem(family: str, entry: Mapping[str, Any], robot: Robot) -> Problem:
         robot.configuration({joint: x for joint, x in values.items() if joint in robot.joint_names}, family)
         for values in (entry["start"], {**entry["start"], **entry["goal"]})
     )
-    return Problem(family, entry["index"], robot, obstacles, start, goal)
+    return Problem(family, entry["index"], robot, robot_name, obstacles, start, goal)
 
 
 def _shape(fields: Mapping[str, Any]) -> Box | Cylinder | Sphere:

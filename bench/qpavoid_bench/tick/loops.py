@@ -31,8 +31,8 @@ from qpavoid_bench.tick.robots import ROBOTS, ROBOTS_FOLDER
 from qpavoid_bench.tick.workloads import Array
 
 PANDA, TCP = ROBOTS["panda"], "panda_hand_tcp"
-LAP = 1000
-"""Control steps after which everything in `circling` repeats."""
+LAP = 10.0
+"""Time after which everything in `circling` repeats [s]."""
 DT = 0.01
 _FAR = 50
 _SHAPES: dict[str, dict[str, Any]] = {
@@ -58,6 +58,8 @@ class Loop:
         every: int = 1,
     ) -> None:
         self.controller, self.q, self.steps = controller, q, 0
+        self.lap = round(LAP / controller.dt)
+        """Control steps after which everything in `circling` repeats."""
         self._targets, self._obstacles, self._every = targets, obstacles, every
         self._inputs = 0.0, targets(0.0), obstacles
 
@@ -87,8 +89,7 @@ def loop_names() -> list[str]:
         *(f"bodies-{kind}" for kind in ("capsule", "convex", "mesh")),
         *(f"bodies-{kind}+{count}" for kind in ("capsule", "convex") for count in (5, 50)),
         *(f"cloud-{count}" for count in _CLOUDS),
-        "circling",
-        "circling+alone",
+        *(f"circling{rate}{variant}" for rate in ("", "-500") for variant in ("", "+alone")),
     ]
 
 
@@ -105,13 +106,17 @@ def make_loop(name: str) -> Loop:
         return _bodies(detail, int(variant or 0))
     if kind == "cloud":
         return _cloud(int(detail))
-    return _from(circling(**({"backup": False} if variant else {})))
+    return _from(circling(1.0 / float(detail) if detail else DT, **({"backup": False} if variant else {})))
 
 
-def circling(**avoidance: Any) -> ScenarioConfig:
-    """Return a Panda's circle among 50 obstacles, 10 of which circle as well; all repeats after LAP control steps."""
-    random = np.random.default_rng(3)
-    lap, obstacles = LAP * DT, []
+def circling(dt: float = DT, **avoidance: Any) -> ScenarioConfig:
+    """Return a Panda's circle among 50 obstacles, 10 of which circle as well; all repeats after a LAP.
+
+    Args:
+        dt: control period [s].
+        avoidance: fields of the block.
+    """
+    random, obstacles = np.random.default_rng(3), []
     for i in range(50):
         angle, distance, height = random.uniform(-np.pi, np.pi), random.uniform(0.45, 0.85), random.uniform(0.1, 0.9)
         size = random.uniform(0.03, 0.06)
@@ -121,24 +126,26 @@ def circling(**avoidance: Any) -> ScenarioConfig:
             "radius": random.uniform(0.05, 0.25),
             "normal": random.normal(size=3).tolist(),
             "start_direction": random.normal(size=3).tolist(),
-            "period": lap / int(random.integers(1, 3)),
+            "period": LAP / int(random.integers(1, 3)),
         }
         shape = {"type": "box", "size": [2.0 * size, size, size]} if i % 2 else {"type": "sphere", "radius": size}
         motion = circle if i < 10 else {"type": "fixed", "position": circle["center"]}
         obstacles.append({"name": f"o{i}", "shape": shape, "motion": motion})
-    tool = {"type": "circle", "radius": 0.12, "normal": [1, 0, 0], "start_direction": [0, 1, 0], "period": lap}
-    return _scenario(obstacles, tool, d1=0.03, **avoidance)
+    tool = {"type": "circle", "radius": 0.12, "normal": [1, 0, 0], "start_direction": [0, 1, 0], "period": LAP}
+    return _scenario(obstacles, tool, dt, d1=0.03, **avoidance)
 
 
-def _scenario(obstacles: list[dict[str, Any]], tool: dict[str, Any], **avoidance: Any) -> ScenarioConfig:
+def _scenario(
+    obstacles: list[dict[str, Any]], tool: dict[str, Any], dt: float = DT, **avoidance: Any
+) -> ScenarioConfig:
     return ScenarioConfig.model_validate(
         {
             "robot": "panda",
             "tasks": [{"frame": TCP, "type": "pose", "motion": tool}],
             "obstacles": obstacles,
             "avoidance": {"d1": 0.02, "d2": 0.10, **avoidance},
-            "dt": DT,
-            "duration": LAP * DT,
+            "dt": dt,
+            "duration": LAP,
         }
     )
 

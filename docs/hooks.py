@@ -1,0 +1,84 @@
+"""What the documentation site adds to these pages: files of the repository that they link to, and maths.
+
+Pages link to tests, examples and results beside `docs`. The site has a copy of each, below `tree/`, so that no link
+leads out of it. Maths is written to MathML when the site is built: a browser draws that by itself.
+"""
+
+import posixpath
+import re
+from html import unescape
+from pathlib import Path
+
+from latex2mathml.converter import convert
+from mkdocs.structure.files import File
+
+ROOT = Path(__file__).parents[1]
+LINK = re.compile(r"(\]\()([^)#\s:]+)((?:#[^)\s]*)?\))")
+MATHS = re.compile(r'<(div|span) class="arithmatex">\\[(\[](.*?)\\[)\]]</\1>', re.DOTALL)
+ALWAYS = ("CHANGELOG.md", "CONTRIBUTING.md", "NOTICE.md")
+"""Files that the navigation names."""
+NOT_FOUND = "---\nsearch:\n  exclude: true\n---\n\n"
+"""Of pages that a search should not come up with."""
+
+
+def place(path):
+    """Where a file or folder of the repository is in the site."""
+    if path.startswith("docs/"):
+        return path.removeprefix("docs/")
+    return f"tree/{path}" if Path(path).suffix in (".md", ".png", ".gif", ".svg") else f"tree/{path}.md"
+
+
+def linked(path, text):
+    """Files and folders of the repository that a Markdown file links to."""
+    links = (posixpath.normpath(posixpath.join(posixpath.dirname(path), match[2])) for match in LINK.finditer(text))
+    return {link for link in links if not link.startswith("..") and (ROOT / link).exists()}
+
+
+def content(path):
+    """Text of a file in Markdown, or the names in a folder."""
+    file = ROOT / path
+    if file.is_dir():
+        names = sorted(child.name for child in file.iterdir() if child.suffix in (".py", ".yaml", ".cpp", ".xml"))
+        return f"{NOT_FOUND}# {path}\n\n" + "\n".join(f"- [{name}]({file.name}/{name})" for name in names) + "\n"
+    if file.suffix == ".md":
+        return file.read_text(encoding="utf-8")
+    if file.suffix in (".png", ".gif", ".svg"):
+        return file.read_bytes()
+    language = {".py": "python", ".yaml": "yaml", ".cpp": "cpp", ".xml": "xml"}.get(file.suffix, "text")
+    return f"{NOT_FOUND}# {path}\n\n````{language}\n{file.read_text(encoding='utf-8')}\n````\n"
+
+
+def on_files(files, config):
+    """Add the files outside `docs` that are linked to, and those that these link to."""
+    pages = {f"docs/{file.src_uri}": Path(file.abs_src_path).read_text("utf-8") for file in files.documentation_pages()}
+    waiting, known = set(ALWAYS).union(*(linked(path, text) for path, text in pages.items())), set()
+    while waiting := {path for path in waiting - known if not path.startswith("docs/")}:
+        path = waiting.pop()
+        known.add(path)
+        text = content(path)
+        files.append(File.generated(config, place(path), content=text))
+        if isinstance(text, str) and (path.endswith(".md") or (ROOT / path).is_dir()):
+            waiting |= linked(path, text)
+    return files
+
+
+def on_page_markdown(markdown, page, config, files):
+    """Point links to files of the repository at their copies."""
+    uri = page.file.src_uri
+    inside = uri.startswith("tree/")
+    source = uri.removeprefix("tree/") if inside else f"docs/{uri}"
+    if inside and not (ROOT / source).exists():
+        source = source.removesuffix(".md")
+
+    def moved(match):
+        path = posixpath.normpath(posixpath.join(posixpath.dirname(source), match[2]))
+        if path.startswith("..") or not (ROOT / path).exists():
+            return match[0]
+        return match[1] + posixpath.relpath(place(path), posixpath.dirname(uri) or ".") + match[3]
+
+    return LINK.sub(moved, markdown)
+
+
+def on_page_content(html, page, config, files):
+    """Write maths as MathML."""
+    return MATHS.sub(lambda match: convert(unescape(match[2]), "block" if match[1] == "div" else "inline"), html)

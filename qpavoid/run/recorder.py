@@ -1,0 +1,245 @@
+"""Store the steps of a run in arrays laid out beforehand."""
+
+from __future__ import annotations
+
+import platform
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pinocchio as pin
+
+from qpavoid import kernels
+from qpavoid.config import Mesh, PointCloud, ScenarioConfig
+from qpavoid.control.obstacle_states import ObstacleStates
+from qpavoid.control.tasks import in_order
+from qpavoid.control.tick import Tick
+from qpavoid.controller import Controller
+from qpavoid.geometry.bodies import enclosing_capsule, surface_triangles
+from qpavoid.model.kinematics import ForwardKinematics
+from qpavoid.model.sample import STATE
+from qpavoid.model.scene import PARKING_DISTANCE, Obstacle, Scene
+from qpavoid.problem import Array, Solution, Status
+from qpavoid.reason import Reason, ReasonKind
+from qpavoid.run.log import STATUSES, Log
+from qpavoid.run.machine import versions
+
+if TYPE_CHECKING:
+    from qpavoid.run.torque_plant import TorquePlant
+
+_MAX_EVENTS = 1000
+"""Number of events that a log keeps: a run that changes its reasons at every step would fill memory."""
+
+
+class Recorder:
+    """Store steps in arrays laid out beforehand, to be taken as a log at any time."""
+
+    def __init__(
+        self, controller: Controller, scenario: ScenarioConfig, ticks: int, plant: TorquePlant | None = None
+    ) -> None:
+        """Lay the arrays out for at most `ticks` steps, of a plant if there is one."""
+        scene, model = controller.scene, controller.scene.robot.model
+        self._scene, self._scenario = scene, scenario
+        self._frames, self._other_tasks = in_order(controller.tasks)
+        self._controller, self._plant = controller, plant
+        self._kinematics, self._query = ForwardKinematics(model), controller.distances()  # of all pairs, near or not
+        self._ends, self._radii = _drawing_axes(scene.robot.bodies)
+        sizes = {"N": ticks, "nq": model.nq, "nv": model.nv, "k": len(self._frames), "s": len(self._other_tasks)}
+        sizes |= {"m": len(plant.torque) if plant else 0, "c": len(plant.point_names) if plant else 0}
+        self._arrays = Log.allocate({**sizes, "b": len(scene.body_names), "o": 0})
+        self._arrays["closest_pair"].fill(-1)
+        self._obstacles: list[Obstacle] = []
+        self._descriptions: list[dict[str, Any]] = []
+        self._names, self._pairs = scene.pair_names, [list(pair) for pair in scene.pair_names]
+        self._pair_numbers = np.append(np.arange(len(self._pairs)), -1)  # of the scene's pairs in that list; of none
+        count = len(scene.slots)
+        self._states, self._margin, self._numbers = np.zeros((count, STATE)), np.zeros(count), np.arange(count)
+        self._moving = [i for i, obstacle in enumerate(scene.slots) if obstacle.moves]
+        self._bodies = np.arange(len(self._ends))
+        self._joints = np.array([body.parentJoint for body in scene.robot.bodies.geometryObjects], dtype=np.intp)
+        self._notice_obstacles()
+        self._count_pairs()
+        self._events: list[list[Any]] = []
+        self._keys: tuple[object, ...] = ()
+        self._count = 0
+
+    def add(self, tick: Tick) -> None:
+        """Store one step."""
+        i, x, state, solution, near = self._count, self._arrays, tick.state, tick.solution, tick.problem.avoidance
+        x["t"][i], x["q"][i], x["v"][i], x["task_error"][i] = state.t, state.q, solution.v, tick.errors
+        x["tool"][i], x["tool_rotation"][i] = tick.kinematics.position, tick.kinematics.rotation
+        for k, (task, target) in enumerate(zip(self._frames, tick.targets, strict=False)):
+            x["target"][i, k] = target.position if task.moves else x["tool"][i, k]
+            if task.turns:
+                x["turn_error"][i, k] = np.linalg.norm(pin.log3(target.rotation @ tick.kinematics.rotation[k].T))
+        for name in ("command_scale", "saturation", "build_time", "solve_time"):
+            x[name][i] = getattr(solution, name)
+        x["stalled"][i], x["severity"][i] = bool(solution.stalled), solution.severity or 0
+        x["status"][i] = STATUSES.index(solution.status)
+        x["slack"][i] = 0.0 if solution.slack is None else np.max(solution.slack, initial=0.0)
+        if len(near.d):
+            d = float(near.d.min())
+            x["alpha"][i], x["beta"][i] = kernels.alpha(d, near.d2), kernels.beta(d, near.d1, near.d2)
+        if self._plant is not None:
+            x["torque"][i], x["contact_force"][i] = self._plant.torque, self._plant.forces()
+            x["slip"][i] = self._plant.slip()
+        self._write_bodies(tick)
+        self._count += 1
+        self._record_events(state.t, solution)
+
+    def _record_events(self, t: float, solution: Solution) -> None:
+        """Store status and reasons where they differ from the previous ones in kind."""
+        reasons = (*solution.reasons, *solution.stalled, *solution.assumptions)
+        if solution.plan:
+            reasons += (Reason.of(ReasonKind.PLAN, detail=solution.plan),)
+        keys = (solution.status, *[(*reason.key, reason.severity) for reason in reasons])
+        eventful = solution.status is not Status.SOLVED or reasons
+        if keys != self._keys and eventful and len(self._events) < _MAX_EVENTS:
+            self._events.append([t, solution.status.value, [reason.as_dict() for reason in reasons]])
+        self._keys = keys
+
+    def _notice_obstacles(self) -> None:
+        """Lay out columns for obstacles that are new, and number pairs with other names anew."""
+        scene, known, x = self._scene, set(map(id, self._obstacles)), self._arrays
+        new = [i for i, obstacle in enumerate(scene.slots) if obstacle.name and id(obstacle) not in known]
+        self._obstacles += [scene.slots[i] for i in new]
+        self._descriptions += [describe_obstacle(scene, i) for i in new]
+        for name in ("obstacle_position", "obstacle_rotation"):
+            count, _, *shape = x[name].shape
+            x[name] = np.concatenate((x[name], np.full((count, len(new), *shape), np.nan)), axis=1)
+        for i, (old, pair) in enumerate(zip(self._names, scene.pair_names, strict=True)):
+            if old != pair:
+                self._pair_numbers[i] = len(self._pairs)
+                self._pairs.append(list(pair))
+        self._names = scene.pair_names
+        columns = {id(obstacle): column for column, obstacle in enumerate(self._obstacles)}
+        self._present = np.array([i for i, obstacle in enumerate(scene.slots) if obstacle.name], dtype=np.intp)
+        self._columns = np.array([columns[id(scene.slots[i])] for i in self._present.tolist()], dtype=np.intp)
+
+    def _count_pairs(self) -> None:
+        """List the pairs of each body, those of attached objects for the bodies that these count for."""
+        scene, attached = self._scene, self._controller.attached
+        counted_body = np.arange(len(scene.geometry.geometryObjects))
+        for i, obstacle in enumerate(scene.slots):
+            if obstacle.name in attached:
+                counted_body[np.flatnonzero(scene.obstacle_of == i)] = _attachment_body(scene, attached[obstacle.name])
+        bodies, count = counted_body[scene.pairs], len(scene.pairs)
+        lists = [np.flatnonzero((bodies == body).any(axis=1)) for body in range(len(self._ends))]
+        self._pairs_of = np.full((len(lists), max(map(len, lists), default=0) + 1), count)  # one that is infinitely far
+        for row, pairs in zip(self._pairs_of, lists, strict=True):
+            row[: len(pairs)] = pairs
+        self._attached = attached
+
+    def _write_bodies(self, tick: Tick) -> None:
+        """Store the distances of all pairs, and the poses of bodies and obstacles, NaN of those that are not there."""
+        scene, n, x = self._scene, self._count, self._arrays
+        if scene.pair_names is not self._names:
+            self._notice_obstacles()
+        if self._controller.attached != self._attached:
+            self._count_pairs()
+        self._kinematics.compute(tick.state.q)
+        states = self._states
+        states[:, :12] = tick.obstacles
+        for i in self._moving if self._scenario.latency else ():  # the step takes them to be where they are later
+            if scene.slots[i].name not in self._attached:
+                states[i, :12] = scene.slots[i].motion.sample(tick.state.t).row[:12]
+        x["obstacle_position"][n, self._columns] = states[self._present, 9:12]
+        x["obstacle_rotation"][n, self._columns] = states[self._present, :9].reshape(-1, 3, 3).transpose(0, 2, 1)
+        self._query.place(ObstacleStates(self._numbers, states, self._margin, {}))
+        self._query.compute(self._kinematics.joint_poses, np.inf)
+        distance, pairs = np.full(len(scene.pairs) + 1, np.inf), self._query.pairs
+        distance[pairs] = self._query.arrays.results[pairs, 0]
+        distance[distance > 0.5 * PARKING_DISTANCE] = np.inf
+        least = int(np.argmin(distance))
+        if distance[least] < np.inf:
+            x["closest_pair"][n] = self._pair_numbers[least]
+        near = distance[self._pairs_of]
+        nearest = near.argmin(axis=1)
+        x["body_distance"][n] = near[self._bodies, nearest]
+        x["body_pair"][n] = self._pair_numbers[self._pairs_of[self._bodies, nearest]]
+        poses = self._kinematics.joint_poses[self._joints]
+        R, p = poses[:, :9].reshape(-1, 3, 3), poses[:, None, 9:]  # by columns: that is Rᵀ
+        x["body_ends"][n] = self._ends @ R + p
+
+    def log(self, stopped_by: str | None = None) -> Log:
+        """Return the steps stored so far as a log.
+
+        Args:
+            stopped_by: why the run ended before its time, if it did.
+        """
+        scene, robot, plant = self._scene, self._scene.robot, self._plant
+        bounds = robot.bounds()
+        meta = {
+            "scenario": self._scenario.source.stem,
+            "title": self._scenario.title,
+            "solver": self._scenario.solver.label,
+            "config": self._scenario.model_dump(mode="json"),
+            "source": self._scenario.source.name,
+            "completed": stopped_by is None and self._count == len(self._arrays["t"]),
+            "stopped_by": stopped_by,
+            "events": self._events,
+            "robot": robot.name,
+            "notes": [str(note) for note in robot.notes],
+            "positions": robot.position_names,
+            "coordinates": robot.coordinate_names,
+            "units": robot.coordinate_units,
+            "velocity_limit": [v if np.isfinite(v) else None for v in bounds.velocity],
+            "position_limits": [
+                [robot.coordinate_names[v], lower, upper]
+                for v, lower, upper in zip(bounds.v_index, bounds.lower.tolist(), bounds.upper.tolist(), strict=True)
+            ],
+            "torque_limit": [x if np.isfinite(x) else None for x in plant.torque_limit] if plant else [],
+            "contact_points": plant.point_names if plant else [],
+            "frames": [task.settings.label for task in self._frames],
+            "tasks": [[task.settings.label, task.unit] for task in self._other_tasks],
+            "bodies": scene.body_names,
+            "body_radii": self._radii,
+            "obstacles": self._descriptions,
+            "pairs": self._pairs,
+            "versions": {"python": platform.python_version(), "machine": platform.machine(), **versions()},
+        }
+        arrays = {name: array[: self._count].copy() for name, array in self._arrays.items()}
+        return Log(**arrays, meta=meta)
+
+
+def _attachment_body(scene: Scene, joint: int) -> int:
+    """Return the body that counts an attached object's distances.
+
+    It is the first body on the joint that the object is attached to, or on one above.
+    """
+    joints, parents = [body.parentJoint for body in scene.robot.bodies.geometryObjects], scene.robot.model.parents
+    while joint and joint not in joints:
+        joint = int(parents[joint])
+    return joints.index(joint) if joint in joints else 0
+
+
+_MAX_FACES = 2000
+"""Triangles or voxels of an obstacle that a log keeps for its figures: a panel shows no more."""
+
+
+def describe_obstacle(scene: Scene, index: int) -> dict[str, Any]:
+    """Return name and shape of an obstacle, and triangles or voxels that come from files."""
+    obstacle = scene.slots[index]
+    described: dict[str, Any] = {"name": obstacle.name, "shape": obstacle.shape.model_dump(mode="json")}
+    if isinstance(obstacle.shape, Mesh):
+        solids = [scene.geometry.geometryObjects[int(g)].geometry for g in np.flatnonzero(scene.obstacle_of == index)]
+        triangles = np.concatenate([surface_triangles(solid) for solid in solids])
+        described["triangles"] = np.round(triangles[:: -(-len(triangles) // _MAX_FACES)], 5).tolist()
+    elif isinstance(obstacle.shape, PointCloud):
+        centers = scene.clouds[index].centers
+        described["voxels"] = np.round(centers[:: -(-len(centers) // _MAX_FACES) or 1], 5).tolist()
+    return described
+
+
+def _drawing_axes(bodies: Any) -> tuple[Array, list[float]]:
+    """Return axis ends (b, 2, 3) in the parent joint's frame and radius of each body.
+
+    A body that is no capsule is drawn as the capsule around it.
+    """
+    ends, radii = np.empty((len(bodies.geometryObjects), 2, 3)), []
+    for i, body in enumerate(bodies.geometryObjects):
+        fit = enclosing_capsule(body.geometry)
+        half = 0.5 * fit.length * fit.rotation[:, 2]
+        local = np.array([fit.center - half, fit.center + half])
+        ends[i] = local @ body.placement.rotation.T + body.placement.translation
+        radii.append(fit.radius)
+    return ends, radii
