@@ -213,11 +213,11 @@ def test_module_runs_as_a_process(tmp_path):
 def test_signal_leaves_a_log_of_the_steps_before(cli, monkeypatch, signum):
     ticks, tick = [], Controller.tick
 
-    def counted(self, *args):
+    def counted(self, *args, **named):
         ticks.append(args)
         if len(ticks) == 60:
             signal.raise_signal(signum)
-        return tick(self, *args)
+        return tick(self, *args, **named)
 
     monkeypatch.setattr(Controller, "tick", counted)
     before = signal.signal(signal.SIGINT, signal.default_int_handler)  # a parent may have it ignored

@@ -32,8 +32,8 @@ from qpavoid.kernels.dynamics import (
     forward_dynamics,
     inverse_dynamics,
     project_widened,
-    slow_rows,
 )
+from qpavoid.kernels.dynamics_rows import slow_rows
 from qpavoid.kernels.estimates import ObstacleArrays, are_fine, check_updates, observe
 from qpavoid.kernels.kinematics import KinematicsArrays, update_kinematics
 from qpavoid.kernels.layout import SUMMARY, RowLayout
