@@ -115,8 +115,8 @@ def test_log_of_malformed_state_names_cause(log, monkeypatch, tmp_path):
     """Malformed state stops the robot and says why."""
     tick = Controller.tick
 
-    def lose_the_encoder(self, q, t=0.0):
-        return tick(self, np.full_like(q, np.nan) if t > 0.045 else q, t)
+    def lose_the_encoder(self, q, t=0.0, **named):
+        return tick(self, np.full_like(q, np.nan) if t > 0.045 else q, t, **named)
 
     monkeypatch.setattr(Controller, "tick", lose_the_encoder)
     blind = simulate(load_scenario("panda_line", SHORT))
