@@ -192,8 +192,9 @@ def test_interrupt_ends_the_batch(tmp_path):
         "        simulate_many([load_scenario('situation1', ['duration=2000'])] * 50, workers)\n"
     )
     with subprocess.Popen(
-        [sys.executable, script], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True
-    ) as run:
+        [sys.executable, script], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # tests in the background may have it ignored
+    ) as run:  # fmt: skip
         assert run.stdout.readline() == "started\n"
         time.sleep(0.3)
         os.killpg(run.pid, signal.SIGINT)

@@ -42,7 +42,7 @@ def outside(log):
 )
 def test_crossing_ball_is_avoided_whatever_the_masses(plant):
     _, closest, figures = play("panda_torque", **plant)
-    assert closest >= D1 - 2e-3  # of wrong gravity over α2 ξ
+    assert closest >= D1 - 0.5e-3  # wrong gravity costs its acceleration over α2 ξ
     assert figures["final_error"] < 0.010
     assert figures["torque"]["jitter"] < 250.0
 
@@ -68,10 +68,10 @@ def test_noise_and_delay_cost_little_distance():
 def test_dive_at_a_table_brakes_in_time(fraction):
     """20 % of the masses are unknown; where motors are weaker, gravity comes to take nearly all of their torques."""
     log, closest, figures = play("panda_dive", [f"dynamics.torque_limits={fraction}"], mass_scale=1.2)
-    assert closest >= D1 - 2e-3
+    assert closest >= D1 - 1e-3
     assert (np.abs(log.torque) <= fraction * LIMITS + 1e-9).all()
     assert outside(log) < 1e-3
-    assert figures["torque"]["jitter"] < 2000.0
+    assert figures["torque"]["jitter"] < (2000.0 if fraction == 1.0 else 5000.0)  # holding rows and braking meet
     assert fraction < 1.0 or figures["severity_counts"]["ALARM"] == 0
 
 

@@ -56,7 +56,7 @@ def make_controller(robot, solver="qp", friction=0.5, contacts=None, priorities=
         build_scene(robot, [ball]), build_tasks(tasks, robot, robot.home), solver, DT,
         Avoidance(d1=D1, d2=0.08, row=Beta(gain=5.0, near_speed=10.0)),
         contacts=contacts or make_contacts(robot, friction),
-        dynamics=Dynamics(**{"tracking_rate": 60.0, "armature": 0.01, **dynamics}),
+        dynamics=Dynamics(**{"tracking_rate": 60.0, "row_rate": 300.0, "armature": 0.01, **dynamics}),
     )  # fmt: skip
 
 
