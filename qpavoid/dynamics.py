@@ -47,3 +47,8 @@ class StepDynamics(NamedTuple):
         """Return the same with other right-hand sides of the holding rows; none, without these rows."""
         n = self.torque_rows
         return self._replace(J=self.J[: n + len(b)], b=np.concatenate((self.b[:n], b)))
+
+
+def mirrored(M: Array) -> Array:
+    """Return the symmetric matrix (n, n) of which only the upper triangle is written, as Pinocchio does."""
+    return np.asarray(np.triu(M) + np.triu(M, 1).T)

@@ -12,7 +12,7 @@ import pinocchio as pin
 from qpavoid import config, kernels
 from qpavoid.control.contacts import ContactRows
 from qpavoid.control.observer import MomentumObserver
-from qpavoid.dynamics import StepDynamics
+from qpavoid.dynamics import StepDynamics, mirrored
 from qpavoid.errors import ConfigError, require_known
 from qpavoid.kernels.layout import RowLayout
 from qpavoid.model.kinematics import ForwardKinematics
@@ -95,7 +95,7 @@ class RobotDynamics:
         """Check that M a + h are the torques at q (nq,), as where joints mimic others they may not be."""
         a = np.linspace(-1.0, 1.0, self._model.nv)
         self.update(q, a)
-        M = np.triu(self._M) + np.triu(self._M, 1).T
+        M = mirrored(self._M)
         torque = pin.rnea(self._model, self._data, q, a, a)
         if not np.abs(M @ a + self._h - torque).max() <= _IDENTITY * max(1.0, float(np.abs(torque).max())):
             raise ConfigError("dynamics: pinocchio's mass matrix of this robot does not match its inverse dynamics")
@@ -105,7 +105,7 @@ class RobotDynamics:
         self.update(q, np.zeros(self._model.nv))
         references: Array = self._acceleration.copy()
         if self.has_torques:
-            M = np.abs(np.triu(self._M) + np.triu(self._M, 1).T)[self.actuated]
+            M = np.abs(mirrored(self._M))[self.actuated]
             left = self._settings.braking_fraction * self.limit - np.abs(self._h[self.actuated])
             own, given = np.maximum(left, _LEAST_LEFT * self.limit) / M.sum(axis=1), references[self.actuated]
             references[self.actuated] = np.where(np.isfinite(given), given, own)

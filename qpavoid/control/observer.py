@@ -12,6 +12,7 @@ import numpy as np
 import pinocchio as pin
 
 from qpavoid import config
+from qpavoid.dynamics import mirrored
 from qpavoid.problem import Array
 from qpavoid.reason import Reason, ReasonKind, Severity
 
@@ -75,7 +76,7 @@ class MomentumObserver:
             A reason for each joint that is touched, not while thresholds are learnt.
         """
         model, data, gain = self._model, self._data, self._settings.rate
-        p = _symmetric(pin.crba(model, data, q)) @ v
+        p = mirrored(pin.crba(model, data, q)) @ v
         bias = pin.computeCoriolisMatrix(model, data, q, v).T @ v - pin.computeGeneralizedGravity(model, data, q)
         if self._p_start is None:
             self._p_start, self._bias = p, bias
@@ -96,8 +97,3 @@ class MomentumObserver:
             )
             for j in touched
         )  # fmt: skip
-
-
-def _symmetric(M: Array) -> Array:
-    """Return a matrix of which pinocchio wrote the upper triangle."""
-    return np.asarray(np.triu(M) + np.triu(M, 1).T)

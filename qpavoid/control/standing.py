@@ -13,7 +13,7 @@ import pinocchio as pin
 from qpavoid import config, kernels
 from qpavoid.control.contacts import ContactRows
 from qpavoid.control.dynamics import RobotDynamics
-from qpavoid.dynamics import StepDynamics
+from qpavoid.dynamics import StepDynamics, mirrored
 from qpavoid.errors import ConfigError
 from qpavoid.kernels.contact_forces import BASE
 from qpavoid.kernels.layout import RowLayout
@@ -120,9 +120,7 @@ class StandingDynamics(RobotDynamics):
 
     def update(self, q: Array, v: Array) -> None:
         """Compute mass matrix and bias torques at q (nq,) and v (nv,)."""
-        M = pin.crba(self._model, self._data, q)
-        self._full[:] = np.triu(M)
-        self._full += np.triu(M, 1).T
+        self._full[:] = mirrored(pin.crba(self._model, self._data, q))
         self._bias[:] = pin.nonLinearEffects(self._model, self._data, q, v)
 
     def stand(self, kinematics: ForwardKinematics, v: Array) -> Contacts:

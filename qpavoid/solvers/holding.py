@@ -6,6 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 
+from qpavoid import kernels
 from qpavoid.dynamics import StepDynamics
 from qpavoid.problem import Array, Problem
 from qpavoid.reason import Reason, ReasonKind, Severity
@@ -17,11 +18,8 @@ _MIN_RELAXATION = 5.0 * TOLERANCE
 """Violation of a holding row that counts [1/s]."""
 _AT_LIMIT = 1e-5
 """Distance of a torque row from its bound below which the torque is at its limit [rad/s or m/s]."""
-
 _AT_EDGE = 1e-7
 """Distance of a force from the edge of its cone below which it is there [N s, scaled]."""
-_ROWS_PER_POINT = 6
-"""Rows of the cone of a contact point, see `kernels.cone_rows`."""
 
 Bounds = tuple[Array, Array]
 """Lower and upper bound (nv,) on v [rad/s or m/s]."""
@@ -71,12 +69,12 @@ def dynamics_reasons(v: Array, problem: Problem, severity: Severity) -> list[Rea
         Reason.of(ReasonKind.HOLDING_RELAXED, names[x.actuated[r]], amount=float(lacking[r]), unit="1/s")
         for r in np.flatnonzero(lacking > _MIN_RELAXATION).tolist()
     ]
-    torques, cones = np.split(violation[:n], [n - _ROWS_PER_POINT * len(x.points)])
+    torques, cones = np.split(violation[:n], [n - kernels.ROWS_PER_POINT * len(x.points)])
     at_limit = torques.reshape(-1, 2).max(axis=1, initial=-np.inf) > -_AT_LIMIT
     for r in np.flatnonzero(at_limit).tolist():
         j, torque = x.actuated[r], float(x.torque(v)[r])
         unit = "Nm" if units[j] == "rad" else "N"
         reasons.append(Reason.of(ReasonKind.AT_TORQUE_LIMIT, names[j], amount=torque, unit=unit, severity=severity))
-    at_edge = cones.reshape(-1, _ROWS_PER_POINT).max(axis=1, initial=-np.inf) > -_AT_EDGE
+    at_edge = cones.reshape(-1, kernels.ROWS_PER_POINT).max(axis=1, initial=-np.inf) > -_AT_EDGE
     frames = dict.fromkeys(x.points[i] for i in np.flatnonzero(at_edge))
     return reasons + [Reason.of(ReasonKind.AT_FRICTION_LIMIT, frame, severity=severity) for frame in frames]
