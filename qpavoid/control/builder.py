@@ -49,6 +49,8 @@ class StepProblem:
     faults: tuple[Reason, ...]
     """Why the robot has to stop."""
     assumptions: tuple[Reason, ...]
+    is_plain: bool = False
+    """Whether it is settled, and nothing stops the robot, nor is there any dynamics or latency to see to."""
 
 
 class ProblemBuilder:
@@ -76,7 +78,7 @@ class ProblemBuilder:
         limits, strided = self._configurations.bounds, np.zeros(2 * model.nq)[::2]
         self._usual_arguments = limits, np.zeros(int(limits[2].max()) + 1), self.rows.targets, self.rows.q
         self._take_usual = kernels.direct(kernels.take_usual, strided, *self._usual_arguments)  # q: of any strides
-        self._has_usual_steps = self.rows.is_compiled and self.rows.dynamics is None and not settings.latency
+        self._has_plain_steps = self.rows.is_compiled and self.rows.dynamics is None and not settings.latency
         self._thread: int | None = None
         self.begun: StepProblem | None = None
         """Step whose command is not known yet."""
@@ -127,19 +129,25 @@ class ProblemBuilder:
             assumptions += self._bounds.outside(q, rows.joint_names, rows.joint_units)
         step = self.begun = self._step
         step.q, step.t, step.resumed, step.targets = rows.q, times.t + self._latency, times.resumed, targets
-        step.is_settled, step.faults, step.assumptions = is_settled, faults, assumptions
+        step.is_settled, step.faults, step.assumptions, step.is_plain = is_settled, faults, assumptions, False
         return step
 
-    def build_usual(self, q: Any, t: Any, targets: Any, obstacles: Any, v: Any) -> StepProblem | None:
-        """Do as `read` and `build` in steps in which that is quick: one compiled call, plain arguments as expected.
+    def begin(self, q: Any, t: Any, targets: Any, obstacles: Any, v: Any) -> StepProblem:
+        """Build the problem of a step of the tasks from its arguments, see `Controller.step`: whatever raises does so.
+
+        Raises:
+            NumericalError, UnknownName: as `Controller.step`.
+        """
+        step = self._build_plain(q, t, targets, obstacles, v)
+        return self.build(self.read(q, t, targets, obstacles, v)) if step is None else step
+
+    def _build_plain(self, q: Any, t: Any, targets: Any, obstacles: Any, v: Any) -> StepProblem | None:
+        """Do as `read` and `build` where one compiled call is all of a step, and arguments are plain and as expected.
 
         Returns:
             None where it is another step, for which nothing has been changed.
-
-        Raises:
-            NumericalError, UnknownName: of an obstacle.
         """
-        if not (self._has_usual_steps and self.begun is None and self._thread is None and _is_plain(q, self._q_shape)):
+        if not (self._has_plain_steps and self.begun is None and self._thread is None and _is_plain(q, self._q_shape)):
             return None
         if v is not None and not (_is_plain(v, self._v_shape) and hypot(*v.tolist()) <= LARGEST_VELOCITY):
             return None
@@ -162,7 +170,7 @@ class ProblemBuilder:
             self.attachments.update()
         if not step.is_settled and rows.position_margin < -OUTSIDE:
             step.assumptions += self._bounds.outside(rows.q, rows.joint_names, rows.joint_units)
-        self.begun = step
+        step.is_plain, self.begun = step.is_settled and not step.faults, step
         return step
 
     def _predict(self, q: Array | None) -> Array:
