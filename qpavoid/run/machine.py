@@ -29,8 +29,8 @@ def machine() -> dict[str, Any]:
 
 def versions(packages: Iterable[str] = PACKAGES) -> dict[str, str]:
     """Return the version of each package that is installed."""
-    found = {package: _version(package) for package in packages}
-    return {package: number for package, number in found.items() if number}
+    installed = {package: _version(package) for package in packages}
+    return {package: number for package, number in installed.items() if number}
 
 
 @cache
