@@ -158,8 +158,7 @@ class Controller(SceneChanges, SplitStep):
             self.add_obstacle(passing)
             self.tick(q, v=v)
             self.remove_obstacle(_WARM_UP)
-        for query in self._builder.rows.query.table.queries:
-            query.forget_guesses()
+        self._builder.rows.query.table.forget_guesses()
         self._arbiter.solver = law
         self.reset()
 

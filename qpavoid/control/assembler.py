@@ -30,8 +30,6 @@ class _Form(NamedTuple):
 
     layout: RowLayout
     packed: Any
-    step: Callable[..., int]
-    """Code of `kernels.control_step` for this memory."""
     views: dict[int, tuple[Proximity, AvoidanceRows]]
     """What there is of k near pairs, by k."""
 
@@ -97,7 +95,8 @@ class RowAssembler(TrackedVelocities):
         self._follows_tasks = True
         self._contact_rows: Contacts | None = None
         self._find = kernels.direct(kernels.find_near_pairs, self._packed, self.q)
-        self._forms = [self._make_form(x)]
+        self._forms = [_Form(x, self._packed, {})]
+        self._step = self._load_step()
         self.use_form(0)
         self.kinematics = Kinematics(x.J_world, x.poses)
         """World Jacobian and poses of the tracked frames in this step."""
@@ -119,7 +118,8 @@ class RowAssembler(TrackedVelocities):
                 numbers["regularization"] = 0.0
             self.dynamics.approaches[0] = self._approaches = law.bounded
         if numbers != {name: getattr(self._layout, name) for name in numbers}:
-            self._forms = [self._make_form(form.layout._replace(**numbers)) for form in self._forms]
+            layouts = [form.layout._replace(**numbers) for form in self._forms]
+            self._forms = [_Form(layout, kernels.pack(layout), {}) for layout in layouts]
             self.use_form(0)
 
     def add_dampers(self, row_gain: float, margin: float, gain: float = 0.0) -> int:
@@ -137,21 +137,20 @@ class RowAssembler(TrackedVelocities):
         dampers = x._replace(
             row_gain=row_gain, near_speed=np.inf, task_switching=False, d1=x.d1 + margin, gain=gains, dead_beat=near_one
         )
-        self._forms.append(self._make_form(dampers))
+        self._forms.append(_Form(dampers, kernels.pack(dampers), {}))
         return len(self._forms) - 1
 
     def use_form(self, number: int) -> None:
         """Choose the form of the rows of the next steps; 0 is that of the settings."""
-        self._layout, self._packed, self._step, self._views = self._forms[number]
+        self._layout, self._packed, self._views = self._forms[number]
         self._row_count = self._layout.summary.view(np.ndarray)["rows"]
 
-    def _make_form(self, layout: RowLayout) -> _Form:
-        """Pack a layout."""
-        packed = kernels.pack(layout)
-        arguments = packed, self.q, self.influence_distance, False, True, False
+    def _load_step(self) -> Callable[..., int]:
+        """Return the code of `kernels.control_step` for all forms, which runs once now: it leaves guesses behind."""
+        arguments = self._packed, self.q, self.influence_distance, False, True, False
         if self.dynamics is not None:
-            return _Form(layout, packed, self.dynamics.step(*arguments), {})
-        return _Form(layout, packed, kernels.direct(kernels.control_step, *arguments), {})
+            return self.dynamics.step(*arguments)
+        return kernels.direct(kernels.control_step, *arguments)
 
     def compute(self, q: Array, targets: Sequence[Any], v_desired: Array | None = None) -> bool:
         """Compute distances, rows and bounds at a configuration, with the obstacles as placed.
