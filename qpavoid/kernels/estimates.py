@@ -221,11 +221,12 @@ def _take_over(x: Any, i: int, kind: int, stamp: float) -> bool:
     gain = 1.0 / x.counts[i]
     if elapsed > 0.0:
         gain = max(gain, elapsed / (_STEADY + elapsed))
-    mean, share = x.means[i], 0.0
+    mean, turning = x.means[i], x.turn_fits[i]
+    if not elapsed <= x.shortest:  # NaN, too
+        fit_turn(turning, new[12:15], elapsed, x.turns[i])
     for c in range(6):
         mean[c] += gain * (new[12 + c] - mean[c])
-    if not elapsed <= x.shortest:  # NaN, too
-        share = fit_turn(x.turn_fits[i], new[12:15], elapsed, x.turns[i])
-        for c in range(6):
-            x.twists[i, c] = mean[c] + (share * (x.turn_fits[i, c] - mean[c]) if c < 3 else 0.0)
+        x.twists[i, c] = mean[c]
+    for c in range(3):
+        x.twists[i, c] += turning[9] * (turning[c] - mean[c])
     return True

@@ -11,9 +11,9 @@ from qpavoid.kernels.packing import compiled
 from qpavoid.kernels.pose_fit import extrapolate
 from qpavoid.problem import Array
 
-TURN_FIT = 9
+TURN_FIT = 10
 """Numbers in the fit of an obstacle's velocities: velocity and acceleration, the mean square of what they leave
-unexplained, how many velocities, and the time since the first of them."""
+unexplained, how many velocities, the time since the first of them, and how far a turn explains them, 0 to 1."""
 _MEMORY = 0.1
 """Time in which a velocity loses weight in the fit [s]: a change of velocity is followed within 0.3 s."""
 _SPAN = 0.2
@@ -26,28 +26,31 @@ less than a third of that, a sudden change of velocity by less than a half."""
 _LEAST_ACCELERATION = 1e-3
 """Below which an obstacle goes straight [m/s²]: 1 mm in the horizon of a backup trajectory."""
 
+_AT_REST = 1e-9
+"""Speed below which none turns [m/s]: round-off."""
+
 
 @compiled
-def fit_turn(fit: Array, velocity: Array, interval: float, turn: Array) -> float:
-    """Put a velocity into the fit of those before; return how far a turn explains them, 0 to 1.
+def fit_turn(fit: Array, velocity: Array, interval: float, turn: Array) -> None:
+    """Put a velocity into the fit of those before.
 
     Velocity v and acceleration a follow with fading memory, θ = memory/(memory + T), as the line of least weighted
     squares does (Brookner 1998, "Tracking and Kalman filtering made easy", 4.1): v += (1 - θ²) e, a += (1 - θ)² e / T,
     more for the first ones; but between two velocities v turns with a, in their plane. So e is 0 on a circle.
 
-    The answer is 1 - (3 s/(a⊥ span))², s the root mean square of e: 0 where noise may be all there is.
+    A turn explains 1 - (3 s/(a⊥ span))² of them, s the root mean square of e: nothing where noise may be all there is.
 
     Args:
         fit: (TURN_FIT,) of the velocities before; overwritten.
         velocity: linear velocity (3,) [m/s].
         interval: time since the one before [s].
-        turn: out: v × a / |v|² times the answer (3,) [rad/s].
+        turn: out: v × a / |v|² times that (3,) [rad/s].
     """
     v, a = fit[:3], fit[3:6]
     turn[:] = 0.0
     if not 0.0 < interval <= _SPAN or fit[7] == 0.0:  # NaN, too
         fit[:], fit[:3], fit[7] = 0.0, velocity[:3], 1.0
-        return 0.0
+        return
     _turn_on(v, a, interval)
     n = fit[7] + 1.0
     fade = _MEMORY / (_MEMORY + interval)
@@ -63,20 +66,17 @@ def fit_turn(fit: Array, velocity: Array, interval: float, turn: Array) -> float
     fit[7], fit[8] = n, min(fit[8] + interval, _SPAN)
     speed, across = _speed_and_turn(v, a, turn)
     unexplained, change = _RATIO * np.sqrt(fit[6]), min(across * fit[8], speed)
-    if n < _FEWEST or across < _LEAST_ACCELERATION or change <= unexplained:
-        turn[:] = 0.0
-        return 0.0
-    share = 1.0 - (unexplained / change) ** 2
+    counts = n >= _FEWEST and across >= _LEAST_ACCELERATION and change > unexplained
+    fit[9] = 1.0 - (unexplained / change) ** 2 if counts else 0.0
     for c in range(3):
-        turn[c] *= share
-    return share
+        turn[c] *= fit[9]
 
 
 @compiled
 def _speed_and_turn(v: Array, a: Array, turn: Array) -> tuple[float, float]:
     """Write v × a / |v|² (3,); return |v| and the acceleration across v."""
     square = v[0] * v[0] + v[1] * v[1] + v[2] * v[2]
-    if square == 0.0:
+    if square < _AT_REST**2:
         turn[:] = 0.0
         return 0.0, 0.0
     turn[0] = (v[1] * a[2] - v[2] * a[1]) / square
@@ -100,8 +100,8 @@ def _turn_on(v: Array, a: Array, t: float) -> None:
     for c in range(3):
         one = v[c] / speed
         two = (a[c] - along * one) / across
-        ahead, aside = cos * one + sin * two, cos * two - sin * one
-        v[c], a[c] = (speed + t * along) * ahead, along * ahead + across * aside
+        forward, aside = cos * one + sin * two, cos * two - sin * one
+        v[c], a[c] = (speed + t * along) * forward, along * forward + across * aside
 
 
 @compiled
