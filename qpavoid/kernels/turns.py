@@ -22,10 +22,9 @@ _FEWEST = 4.0
 """Velocities from which on a turn counts [-]: two explain themselves."""
 _RATIO = 3.0
 """Change of velocity, over what is left unexplained, from which on a turn counts [-]: noise alone changes the fit by
-less than a third of that, a sudden change of velocity by less than a half."""
+about half of it, a sudden change of velocity by up to 2.6 times."""
 _LEAST_ACCELERATION = 1e-3
 """Below which an obstacle goes straight [m/s²]: 1 mm in the horizon of a backup trajectory."""
-
 _AT_REST = 1e-9
 """Speed below which none turns [m/s]: round-off."""
 
