@@ -7,9 +7,9 @@ from math import inf, nan
 import numpy as np
 
 from qpavoid import kernels
-from qpavoid.control.inputs import FARTHEST, FASTEST
 from qpavoid.kernels import Pieces
 from qpavoid.kernels.estimates import QUATERNION
+from qpavoid.kernels.obstacles import FARTHEST, FASTEST
 from qpavoid.kernels.pose_fit import FIT
 from qpavoid.kernels.turns import TURN_FIT
 from qpavoid.model.sample import POSE, STATE, Sample

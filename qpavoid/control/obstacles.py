@@ -17,14 +17,14 @@ import numpy as np
 from qpavoid import kernels
 from qpavoid.config import Sensing
 from qpavoid.control.estimates import MeasuredStates
-from qpavoid.control.inputs import FARTHEST, FASTEST, FAULTS
+from qpavoid.control.inputs import FAULTS
 from qpavoid.control.obstacle_states import NOTHING, Observation, ObstacleStates, StepUpdate
 from qpavoid.control.trajectories import TrajectoryBatch, extrapolate
 from qpavoid.control.update_parts import unlikely
 from qpavoid.control.updates import NO_UPDATE, Update, UpdateReader
 from qpavoid.errors import NumericalError
 from qpavoid.kernels import Prediction
-from qpavoid.kernels.obstacles import FAST, NORMALISED, NOT_FINITE, SAMPLE
+from qpavoid.kernels.obstacles import FARTHEST, FAST, FASTEST, NORMALISED, NOT_FINITE, SAMPLE
 from qpavoid.model.sample import Sample
 from qpavoid.model.scene import Obstacle
 from qpavoid.model.trajectory import Motion

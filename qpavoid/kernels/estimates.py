@@ -17,10 +17,8 @@ from qpavoid.kernels.obstacles import (
     NORMALISED,
     POSE,
     REST,
-    SAMPLE,
     Pieces,
     check_state,
-    check_states,
     sample_pieces,
 )
 from qpavoid.kernels.packing import compiled
@@ -85,23 +83,6 @@ class ObstacleArrays(NamedTuple):
     """Largest coordinate of a position that can be true [m]."""
     max_speed: float
     """Largest component of a twist that can be true [m/s, rad/s]."""
-
-
-@compiled
-def are_fine(states: Array, max_position: float, max_speed: float) -> bool:
-    """Return True if `check_states` finds all of some samples FINE.
-
-    Args:
-        states: (k, 18), normalised in place.
-        max_position: largest coordinate of a position [m].
-        max_speed: largest component of a twist [m/s, rad/s].
-    """
-    k = len(states)
-    codes, _ = check_states(states, np.arange(k), np.full(k, SAMPLE), max_position, max_speed)
-    faults = 0
-    for code in codes:
-        faults += code != FINE
-    return faults == 0
 
 
 @compiled
