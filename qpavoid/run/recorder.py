@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 _MAX_EVENTS = 1000
 """Number of events that a log keeps: a run that changes its reasons at every step would fill memory."""
 
-_KEPT = 64
+_CHUNK = 64
 """Steps whose poses and distances are kept until they are stored together: array functions cost as much for one."""
 
 
@@ -61,8 +61,8 @@ class Recorder:
         self._moving = [i for i, obstacle in enumerate(scene.slots) if obstacle.moves]
         self._bodies = np.arange(len(self._ends))
         self._joints = np.array([body.parentJoint for body in scene.robot.bodies.geometryObjects], dtype=np.intp)
-        self._distance = np.full((_KEPT, len(self._pairs) + 1), np.inf)
-        self._placed, self._posed = np.zeros((_KEPT, count, POSE)), np.zeros((_KEPT, len(self._joints), POSE))
+        self._distance = np.full((_CHUNK, len(self._pairs) + 1), np.inf)
+        self._placed, self._posed = np.zeros((_CHUNK, count, POSE)), np.zeros((_CHUNK, len(self._joints), POSE))
         self._count = self._flushed = 0
         self._notice_obstacles()
         self._count_pairs()
@@ -91,7 +91,7 @@ class Recorder:
             x["slip"][i] = self._plant.slip()
         self._write_bodies(tick)
         self._count += 1
-        if self._count - self._flushed == _KEPT:
+        if self._count - self._flushed == _CHUNK:
             self._flush()
         self._record_events(state.t, solution)
 
