@@ -48,6 +48,8 @@ _BIAS_SPEEDS = (2.0, 30.0)
 _CANDIDATES_AHEAD = 3
 """Candidates that can be computed before the kept trajectory is no longer valid [-]: as many may fail. It holds the
 velocity of the solver as long, and the next one is begun so early."""
+_STEPS_BETWEEN = 4
+"""Control steps after which is asked again whether the kept trajectory lasts so long [-]: where all motions are known."""
 _FIRST_CANDIDATES = 7
 """Candidates that are tried near an obstacle before one is followed that does not suffice [-]."""
 _URGENT = 0.5
@@ -115,6 +117,8 @@ class BackupPlanner:
         """Kept, from the present state on."""
         self._kind, self._age = -1, 0
         """Of the candidate, -1 without one; control steps since it began."""
+        self._lasting_steps = 0
+        """Control steps for which the kept trajectory is known to last long enough."""
         self._tried, self._sampled, self._untried = [0, 0], 0, _FIRST_CANDIDATES
         self._moving = self._obstacles.moving
 
@@ -171,7 +175,7 @@ class BackupPlanner:
         """Return the enabled pairs (m,), without those in contact."""
         enabled = self._rollouts.enabled
         enabled[proximity.pair[proximity.distance < TOUCH]] = False
-        if not np.array_equal(enabled, self._last_enabled):
+        if enabled.tobytes() != self._last_enabled.tobytes():
             self._last_enabled = enabled
         return self._last_enabled  # the same array, so that it need not be compared again
 
@@ -220,9 +224,9 @@ class BackupPlanner:
                 continue
             candidate = rollouts.advance(candidate, self._age)
             if kind == _ALONE:
-                self._backup = candidate
+                self._backup, self._lasting_steps = candidate, 0
             elif self._is_acceptable(candidate, command.after_task):
-                self._backup, command = candidate, command.to_task()
+                self._backup, self._lasting_steps, command = candidate, 0, command.to_task()
                 if candidate.score >= rollouts.sufficient_score:
                     self._tried, self._sampled, self._untried, is_valid = [0, 0], 0, 0, True
                     if self._age == 0:
@@ -231,8 +235,20 @@ class BackupPlanner:
 
     def _lasts(self, command: _Command) -> bool:
         """Return whether the kept trajectory will be valid until others are known, if the same is commanded."""
-        start, backup, steps = command.after, self._backup, self._steps_ahead
-        if backup is None or not command.is_task or len(backup.v) <= steps:
+        if self._backup is None or not command.is_task:
+            return False
+        if self._lasting_steps > 0:
+            self._lasting_steps -= 1
+            return True
+        if len(self._obstacles.external) == 0 and self._is_valid_after(self._steps_ahead + _STEPS_BETWEEN - 1, command):
+            self._lasting_steps = _STEPS_BETWEEN - 1
+            return True
+        return self._is_valid_after(self._steps_ahead, command)
+
+    def _is_valid_after(self, steps: int, command: _Command) -> bool:
+        """Return whether the kept trajectory will be valid some steps later, if the same is commanded."""
+        start, backup = command.after, self._backup
+        if backup is None or len(backup.v) <= steps:
             return False
         q = pin.integrate(self._model, start.q, steps * self._dt * start.v)
         later = Start(q, start.v, np.zeros_like(start.v), start.t + steps * self._dt, start.enabled)
