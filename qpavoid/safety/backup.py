@@ -35,8 +35,10 @@ from qpavoid.safety.rollout import LEAST_SCORE, BackupPolicy, BackupRollouts, Ba
 
 _PERIOD_FRACTION = 0.128
 """Fraction of a control period in which candidates are computed [-]."""
-_POSE_TIME, _SEARCH_TIME = 12e-6, 80e-6
+_POSE_TIME, _SEARCH_TIME = 10.5e-6, 80e-6
 """Time that a pose of a candidate takes, and that a search takes besides [s]: of a Panda among 50 obstacles."""
+_BEGIN_POSES = 8
+"""Poses that take as long as it takes to begin a candidate [-]: at its first pose, all distances are new."""
 _FEWEST_POSES = 10
 """Poses that are evaluated in a control step at least [-]: a candidate has about 45, and an obstacle does not wait."""
 _HORIZONS = (0.2, 0.05, 0.5)
@@ -49,7 +51,7 @@ _CANDIDATES_AHEAD = 3
 """Candidates that can be computed before the kept trajectory is no longer valid [-]: as many may fail. It holds the
 velocity of the solver as long, and the next one is begun so early."""
 _STEPS_BETWEEN = 4
-"""Control steps after which is asked again whether the kept trajectory lasts so long [-]: where all motions are known."""
+"""Control steps between two checks that the kept trajectory lasts so long [-], where all motions are known."""
 _FIRST_CANDIDATES = 7
 """Candidates that are tried near an obstacle before one is followed that does not suffice [-]."""
 _URGENT = 0.5
@@ -91,8 +93,10 @@ class BackupPlanner:
         self._rollouts = BackupRollouts(settings, query.table, obstacles)
         self._approach = ApproachCheck(settings, query, self._rollouts.lever_arm, obstacles)
         self._poses = max(_FEWEST_POSES, round((_PERIOD_FRACTION * settings.dt - _SEARCH_TIME) / _POSE_TIME))
-        """Poses of candidates that are evaluated in a control step: 100 at 100 Hz, 15 at 500 Hz."""
-        self._steps_ahead = ceil(_CANDIDATES_AHEAD * self._rollouts.usual_poses / self._poses)
+        """Poses of candidates that are evaluated in a control step: 114 at 100 Hz, 17 at 500 Hz."""
+        self._candidate_poses = self._rollouts.usual_poses + _BEGIN_POSES
+        """Poses that take as long as a candidate."""
+        self._steps_ahead = ceil(_CANDIDATES_AHEAD * self._candidate_poses / self._poses)
         """Control steps in which that many candidates are computed."""
         self._budget = settings.budget
         self.is_cut = False
@@ -207,6 +211,7 @@ class BackupPlanner:
                 if self._steps_needed(poses) > self._steps_needed(self._poses) or self._lasts(command):
                     break
                 self._begin(command, is_valid, poses)
+                poses = max(poses - _BEGIN_POSES, 1)
             portion = min(poses, _PORTION) if self._budget.is_limited else poses
             try:
                 code = rollouts.resume(portion)
@@ -309,7 +314,7 @@ class BackupPlanner:
 
     def _steps_needed(self, poses: int) -> int:
         """Return the control steps after this one that a trajectory takes with so many poses in this one."""
-        return max(0, ceil((self._rollouts.usual_poses - poses) / self._poses))
+        return max(0, ceil((self._candidate_poses - poses) / self._poses))
 
     def _not_worse(self, later: BackupScore, now: BackupScore) -> bool:
         """Return whether a trajectory that begins in the next control step is not worse than one that begins now.

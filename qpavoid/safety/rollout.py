@@ -217,8 +217,8 @@ class BackupRollouts:
         """
         if trajectory.contact_time < start.t + HORIZON - 1e-9:
             return False
-        delay = abs(start.t - trajectory.start.t)
-        if delay > self._dt or not _is_equal(trajectory.start.enabled, start.enabled):
+        delay, one, two = abs(start.t - trajectory.start.t), trajectory.start.enabled, start.enabled
+        if delay > self._dt or not (one is two or np.array_equal(one, two)):
             return False
         offset = pin.difference(self._model, trajectory.start.q, start.q)
         v, dv = np.ascontiguousarray(start.v), np.ascontiguousarray(start.dv)
@@ -339,10 +339,6 @@ def lay_out_pairs(query: DistanceQuery) -> PairMemory:
         points=np.zeros((m, 6)),
         due=np.zeros(m, np.intp),
     )
-
-
-def _is_equal(a: Mask, b: Mask) -> bool:
-    return a is b or np.array_equal(a, b)
 
 
 def _ramp_limits(bounds: JointBounds, dt: float) -> RampLimits:
