@@ -60,6 +60,7 @@ from qpavoid.kernels.step import (
     tracking_violation,
     violation,
 )
+from qpavoid.kernels.straying import any_displaced, any_moves, largest_part, strays, surprise
 from qpavoid.kernels.structures import direct, pack
 from qpavoid.kernels.task_curvature import add_curvature
 from qpavoid.kernels.tasks import frame_rows, projection_cost
@@ -89,6 +90,8 @@ __all__ = [
     "add_curvature",
     "advance_rollout",
     "alpha",
+    "any_displaced",
+    "any_moves",
     "are_fine",
     "assemble",
     "backup_rows",
@@ -120,6 +123,7 @@ __all__ = [
     "is_clear",
     "jerk_limited_stop",
     "joint_speeds",
+    "largest_part",
     "least_margin",
     "leaves_position_limits",
     "mark_own_pixels",
@@ -153,6 +157,8 @@ __all__ = [
     "speed_to_stop",
     "standing_dynamics",
     "stop_velocity",
+    "strays",
+    "surprise",
     "tracking_law",
     "tracking_violation",
     "update_kinematics",

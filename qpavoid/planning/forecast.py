@@ -50,6 +50,17 @@ class Snapshot(NamedTuple):
     """Targets that a program gives, by name of the task; they are taken to stay where they are."""
 
 
+class Expected(NamedTuple):
+    """What a forecast lets one expect: all of it that a controller compares with what comes."""
+
+    t: Array
+    """(n + 1,) [s]."""
+    q: Array
+    """(n + 1, nq)."""
+    errors: Array
+    """(n + 1,) largest error of a frame [m, rad]."""
+
+
 class Forecast(NamedTuple):
     """What drives lead to; row i is of the control step i, and the last one is the end."""
 
@@ -74,6 +85,11 @@ class Forecast(NamedTuple):
         return min(max(round(float((t - self.t[0]) / (self.t[-1] - self.t[0]) * steps)), 0), steps) if steps else 0
 
     @property
+    def expected(self) -> Expected:
+        """What it lets one expect."""
+        return Expected(self.t, self.q, self.errors)
+
+    @property
     def rms_error(self) -> float:
         """Root mean square of the errors [m, rad]."""
         return float(np.sqrt(np.mean(self.errors**2)))
@@ -82,11 +98,6 @@ class Forecast(NamedTuple):
     def final_error(self) -> float:
         """Largest error of a frame at the end [m, rad]."""
         return float(self.errors[-1])
-
-
-def largest_error(parts: Array) -> float:
-    """Return the largest error of frames, of their positions and orientations (3 (p + t),) [m, rad]."""
-    return float(np.linalg.norm(parts.reshape(-1, 3), axis=1).max())
 
 
 class Forecaster(SceneChanges):
