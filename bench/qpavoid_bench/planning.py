@@ -102,7 +102,7 @@ class _Given(Loop):
 def _make_loop(is_given: bool, planned: bool) -> Loop:
     scenario: ScenarioConfig = circling(_DT, backup=False)
     if planned:
-        config = Planning(worker="process", **({"period": _DT} if is_given else {}))
+        config = Planning(worker="process", period=_DT) if is_given else Planning(worker="process")
         scenario = scenario.model_copy(update={"planning": config})
     loop = (_Given if is_given else Loop)(*Controller.from_scenario(scenario))
     return loop

@@ -153,13 +153,13 @@ def serve() -> None:
     worker = InlineWorker(pickle.load(source))
     answer: Answer | None = Answer(0, None)  # it is ready
     while True:
-        if answer is not None:
-            pickle.dump(answer, answers)
-            answers.flush()
         try:
+            if answer is not None:
+                pickle.dump(answer, answers)
+                answers.flush()
             message = pickle.load(source)
-        except EOFError:
-            return
+        except (EOFError, BrokenPipeError):  # the pipe is closed at its other end
+            os._exit(0)
         if isinstance(message, Question):
             worker.ask(message)
         else:
