@@ -19,6 +19,7 @@ from qpavoid.control.settings import ControlSettings
 from qpavoid.control.tasks import FrameTask, RowTask
 from qpavoid.control.tasks.relative import Relative
 from qpavoid.control.trajectories import extrapolate
+from qpavoid.model.cloud import Points, Voxels
 from qpavoid.model.sample import Sample
 from qpavoid.model.trajectory import Trajectory
 from qpavoid.planning.drive import Drive, Driver
@@ -46,6 +47,8 @@ class Snapshot(NamedTuple):
     """What it follows."""
     obstacles: Mapping[str, Array]
     """(18,) states of those that a program gives, by name."""
+    clouds: Mapping[str, Voxels]
+    """What is in point clouds among them that were given points."""
     targets: Mapping[str, Any]
     """Targets that a program gives, by name of the task; they are taken to stay where they are."""
 
@@ -165,7 +168,7 @@ class Forecaster(SceneChanges):
         errors, clearance = np.zeros((count + 1, len(rows.frame_errors))), np.full(count + 1, np.inf)
         q[0], v[0], dv[0] = start.q, start.v, start.dv
         self._restart(start)
-        obstacles = {name: Sample.of_row(row) for name, row in start.obstacles.items()} or None
+        obstacles = _updates(start)
         stalled: tuple[Reason, ...] = ()
         for k in range(count + 1):
             updates = obstacles if k == 0 else None
@@ -233,6 +236,14 @@ class Forecaster(SceneChanges):
         self._least[:] = np.where(is_movable, distances.d1, -np.inf)
         pairs = distances.pair
         self._least[pairs] = np.minimum(self._least[pairs], distances.d - _PRESENT)
+
+
+def _updates(start: Snapshot) -> dict[str, Sample | Points] | None:
+    """Return what a step is given of obstacles, None of none; points stay as they are."""
+    updates: dict[str, Sample | Points] = {name: Sample.of_row(row) for name, row in start.obstacles.items()}
+    for name, voxels in start.clouds.items():
+        updates[name] = Points(voxels, Sample.of_row(start.obstacles[name]), at_rest=True)
+    return updates or None
 
 
 def _part(target: Any, moves: bool, turns: bool) -> Any:

@@ -13,6 +13,7 @@ from qpavoid.control.builder import ProblemBuilder, StepProblem
 from qpavoid.control.contacts import ContactRows
 from qpavoid.control.settings import ControlSettings
 from qpavoid.control.tasks import FrameTask, RowTask
+from qpavoid.model.cloud import Voxels
 from qpavoid.model.sample import STATE, Sample
 from qpavoid.planning.candidates import Decision, is_sound
 from qpavoid.planning.drive import TRACK, Driver
@@ -91,6 +92,7 @@ class Replanning:
         self._expected: Expected | None = None
         self._question: Question | None = None
         self._asked_states = _NO_STATES  # of obstacles that a program gives, in the last look
+        self._asked_clouds = dict[int, Voxels]()  # what was in clouds then
         self._last_look, self._next_look, self._wait = -np.inf, -np.inf, self._config.period
         self._looks = 0
         self._last_states = _NO_STATES  # in the step before
@@ -162,6 +164,8 @@ class Replanning:
         which, states = tracker.external, tracker.current.states
         if len(which) != len(self._asked_states):
             return True
+        if any(voxels is not self._asked_clouds.get(i) for i, voxels in tracker.current.voxels.items()):
+            return True
         if not len(which) or kernels.any_moves(states, which):
             return False  # then looks are periodic
         return bool(kernels.any_displaced(states, which, self._asked_states, _CHANGED, _TURNED))
@@ -181,12 +185,14 @@ class Replanning:
         """Ask for a look ahead from a step."""
         tracker, previous = self._builder.tracker, self._builder.rows.previous
         slots, states = self._settings.scene.slots, tracker.current.states
-        self._asked_states = asked = states[tracker.external]
+        asked, clouds = states[tracker.external], dict(tracker.current.voxels)
+        self._asked_states, self._asked_clouds = asked, clouds
         obstacles = {slots[i].name: state for i, state in zip(tracker.external.tolist(), asked, strict=True)}
+        points = {name: clouds[i] for i, name in zip(tracker.external.tolist(), obstacles, strict=True) if i in clouds}
         is_moving = bool(kernels.any_moves(states, tracker.external))
         is_noisy = is_moving and (self._measured < _MEASURED or self._noise > _NOISE**2)
         q, v, dv = step.q.copy(), previous.v.copy(), previous.dv.copy()
-        start = Snapshot(step.t, q, v, dv, self._driver.drive, obstacles, self._given_targets(step))
+        start = Snapshot(step.t, q, v, dv, self._driver.drive, obstacles, points, self._given_targets(step))
         self._number += 1
         self._question = Question(self._number, start, is_moving, is_noisy, self._looks)
         self._looks += 1
