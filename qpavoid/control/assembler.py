@@ -86,13 +86,15 @@ class RowAssembler(TrackedVelocities):
         self.frame_count, self.tasks = len(frames), (*frames, *row_tasks)
         """Tasks in the order of `in_order`; the first `frame_count` are frames."""
         self._b_feasible = np.zeros(len(x.b))
-        self._is_compiled = self._forward.is_compiled and self.query.is_compiled and not row_tasks and contacts is None
+        self.is_compiled = self._forward.is_compiled and self.query.is_compiled and not row_tasks and contacts is None
+        """Whether a step at velocity level is one compiled call, but for pairs whose cores meet."""
         self._finds_pairs = self._forward.is_compiled and not self.query.has_clouds
         self.q: Array = scene.robot.home.copy()
         """Configuration (nq,) of the last step."""
         self.v = x.v
         """Velocity (nv,) that may be commanded, where `compute` says so; the next step overwrites it."""
-        self._follows_tasks = True
+        self.follows_tasks = True
+        """Whether the step is of the tasks, or of a velocity that is given."""
         self._contact_rows: Contacts | None = None
         self._find = kernels.direct(kernels.find_near_pairs, self._packed, self.q)
         self._forms = [_Form(x, self._packed, {})]
@@ -163,19 +165,14 @@ class RowAssembler(TrackedVelocities):
         Returns:
             Whether `v` is what the law and the stop look-ahead lead to; else they have to see `problem`.
         """
-        x, from_tasks, self._follows_tasks = self._layout, v_desired is None, v_desired is None
+        x, from_tasks, self.follows_tasks = self._layout, v_desired is None, v_desired is None
         self.q[:] = q  # the code takes q as it is: in one piece, and writeable
         if v_desired is not None:
             x.v_tracking[:] = v_desired
         if self.dynamics is not None:
             self.dynamics.update(self.q, x.v_prev)
-        if self._is_compiled:
-            moving = self.query.is_moving
-            code = self._step(self._packed, self.q, self.influence_distance, moving, from_tasks, False)
-            if code != TO_MEASURE:
-                return code == SETTLED
-            self.query.finish()
-            return self._finish()
+        if self.is_compiled:
+            return self.run()
         self._measure()
         if from_tasks and self.task_errors.size:
             self._task_rows.write(q, self._forward, targets[len(self.targets) :])
@@ -188,12 +185,21 @@ class RowAssembler(TrackedVelocities):
                 x.v_prev[:] = resting.project(x.v_prev)
         return self._finish()
 
+    def run(self) -> bool:
+        """Compute a step at `q` in one call, but for pairs whose cores meet; return what `compute` does."""
+        moving, from_tasks = self.query.is_moving, self.follows_tasks
+        code = self._step(self._packed, self.q, self.influence_distance, moving, from_tasks, False)
+        if code != TO_MEASURE:
+            return code == SETTLED
+        self.query.finish()
+        return self._finish()
+
     def follow(self, v_desired: Array, at_once: bool = False) -> bool:
         """Follow a velocity (nv,) in place of the tasks in the last step after all; return what `compute` does.
 
         With `at_once`, a torque level takes it as that of the end of the control period, and does not approach it.
         """
-        self._follows_tasks, self._layout.v_tracking[:] = False, v_desired
+        self.follows_tasks, self._layout.v_tracking[:] = False, v_desired
         if self.dynamics is None or not at_once:
             return self._finish()
         self.dynamics.approaches[0] = False
@@ -202,7 +208,7 @@ class RowAssembler(TrackedVelocities):
 
     def _finish(self) -> bool:
         """Compute a step whose kinematics and distances are up to date."""
-        arguments = self.query.is_moving, self._follows_tasks, True
+        arguments = self.query.is_moving, self.follows_tasks, True
         code = self._step(self._packed, self.q, self.influence_distance, *arguments)
         if self._contact_rows is not None:
             self._hold(self._contact_rows)
@@ -229,7 +235,7 @@ class RowAssembler(TrackedVelocities):
     def problem(self) -> Problem:
         """Return the problem of the last step."""
         x, (_, violation, is_clear, position_margin, bent) = self._layout, self._layout.summary.item()
-        tracking, levels = (self._tracking, self._levels) if self._follows_tasks else (self._following, ())
+        tracking, levels = (self._tracking, self._levels) if self.follows_tasks else (self._following, ())
         return Problem(
             tracking, self._view()[1], x.lower, x.upper, *self._hard, x.v_stop, self._scene.pair_names,
             self.joint_names, self.joint_units, x.v_tracking, violation, self._contact_rows, levels, None, bent,
@@ -240,7 +246,7 @@ class RowAssembler(TrackedVelocities):
     def _hold(self, contacts: Contacts) -> None:
         """Let the velocity that is tracked hold the contacts."""
         x, summary = self._layout, self._layout.summary[0]
-        if self._follows_tasks:
+        if self.follows_tasks:
             summary.bent = self._track_within(contacts)
         else:
             x.v_tracking[:] = contacts.project(x.v_tracking)

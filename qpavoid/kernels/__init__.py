@@ -1,6 +1,7 @@
 """Array work of a control step: loops that numba compiles at their first use, and stores on disk (`kernels.cache`)."""
 
 from qpavoid.kernels.approach import ApproachArrays, comes_near, extend_paths, write_path_point
+from qpavoid.kernels.arguments import take_usual
 from qpavoid.kernels.backup import (
     backup_rows,
     closes_below,
@@ -34,7 +35,7 @@ from qpavoid.kernels.dynamics import (
     project_widened,
 )
 from qpavoid.kernels.dynamics_rows import slow_rows
-from qpavoid.kernels.estimates import ObstacleArrays, are_fine, check_updates, observe
+from qpavoid.kernels.estimates import ObstacleArrays, check_updates, observe
 from qpavoid.kernels.kinematics import KinematicsArrays, update_kinematics
 from qpavoid.kernels.layout import SUMMARY, RowLayout
 from qpavoid.kernels.margins import distances_of, least_margin
@@ -60,7 +61,7 @@ from qpavoid.kernels.step import (
     tracking_violation,
     violation,
 )
-from qpavoid.kernels.straying import any_displaced, any_moves, largest_part, strays, surprise
+from qpavoid.kernels.straying import any_displaced, any_moves, strays, surprise
 from qpavoid.kernels.structures import direct, pack
 from qpavoid.kernels.task_curvature import add_curvature
 from qpavoid.kernels.tasks import frame_rows, projection_cost
@@ -92,7 +93,6 @@ __all__ = [
     "alpha",
     "any_displaced",
     "any_moves",
-    "are_fine",
     "assemble",
     "backup_rows",
     "begin_rollout",
@@ -123,7 +123,6 @@ __all__ = [
     "is_clear",
     "jerk_limited_stop",
     "joint_speeds",
-    "largest_part",
     "least_margin",
     "leaves_position_limits",
     "mark_own_pixels",
@@ -159,6 +158,7 @@ __all__ = [
     "stop_velocity",
     "strays",
     "surprise",
+    "take_usual",
     "tracking_law",
     "tracking_violation",
     "update_kinematics",
