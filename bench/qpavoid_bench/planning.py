@@ -53,10 +53,10 @@ def _sections(steps: int) -> Iterator[str]:
     rows, notes = [], []
     for name, is_given in (("nothing to plan", False), ("always planning", True)):
         result = _compare(is_given, steps)
-        for planned, (ns, share) in result.items():
+        for planned, (ns, load) in result.items():
             for row, part in enumerate(("step", "late")):
                 cells = [number(float(x)) for x in 1e-3 * np.percentile(ns[row], [50, 99, 99.9, 100])]
-                busy = f"{100 * share:.0f} %" if planned and not row else ""
+                busy = f"{100 * load:.0f} %" if planned and not row else ""
                 rows.append([name, "process" if planned else "none", part, *cells, busy])
         without, plans = (1e-3 * np.percentile(result[planned][0][0], [50, 99]) for planned in (False, True))
         notes.append(
@@ -68,17 +68,17 @@ def _sections(steps: int) -> Iterator[str]:
 
 
 def _compare(is_given: bool, steps: int) -> dict[bool, tuple[Any, float]]:
-    """Return times of steps and their lateness (2, steps) [ns], and the share of a core that the process has taken."""
+    """Return times of steps and their lateness (2, steps) [ns], and the load of a core by the process."""
     loops = {planned: _make_loop(is_given, planned) for planned in (False, True)}
     times: dict[bool, list[Any]] = {False: [], True: []}
-    shares: dict[bool, list[float]] = {False: [], True: []}
+    loads: dict[bool, list[float]] = {False: [], True: []}
     for part in range(2 * _BLOCKS):
         planned = bool(part % 2)
         _pace(loops[planned], _LEAD_IN)
         begin, used = perf_counter_ns(), _seconds_of_children()
         times[planned].append(_pace(loops[planned], steps // _BLOCKS))
-        shares[planned].append((_seconds_of_children() - used) / (1e-9 * (perf_counter_ns() - begin)))
-    return {planned: (np.concatenate(times[planned], axis=1), float(np.mean(shares[planned]))) for planned in times}
+        loads[planned].append((_seconds_of_children() - used) / (1e-9 * (perf_counter_ns() - begin)))
+    return {planned: (np.concatenate(times[planned], axis=1), float(np.mean(loads[planned]))) for planned in times}
 
 
 class _Given(Loop):
