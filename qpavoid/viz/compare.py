@@ -56,14 +56,14 @@ def solver_styles(logs: Sequence[Log]) -> list[dict[str, Any]]:
     used: list[tuple[str, Any]] = [style for style in chosen if style is not None]
     free = [(colour, dash) for dash in DASHES[::-1] for colour in COLOURS[::-1]]  # wide gaps first
     styles = []
-    for i, solver in enumerate(solvers):
+    for i, name in enumerate(names):
         style = chosen[i]
         if style is None:
             colours, dashes = zip(*used, strict=True) if used else ((), ())
             style = min(free, key=lambda s: (s in used, colours.count(s[0]), dashes.count(s[1])))
             used.append(style)
         colour, dash = style
-        label = f"{names[i]} ({names[:i].count(names[i])})" if names[i] in names[:i] else names[i]
+        label = f"{name} ({names[:i].count(name)})" if name in names[:i] else name
         styles.append({"label": label, "color": colour, "linestyle": dash, "zorder": 3.0 if dash == "-" else 3.5})
     return styles
 
