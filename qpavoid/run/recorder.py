@@ -81,6 +81,7 @@ class Recorder:
         for name in ("command_scale", "saturation", "build_time", "solve_time"):
             x[name][i] = getattr(solution, name)
         x["stalled"][i], x["severity"][i] = bool(solution.stalled), solution.severity or 0
+        x["planned"][i] = bool(solution.plan)
         x["status"][i] = STATUSES.index(solution.status)
         x["slack"][i] = 0.0 if solution.slack is None else np.max(solution.slack, initial=0.0)
         if len(near.d):
