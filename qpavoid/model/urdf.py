@@ -203,10 +203,11 @@ def missing_meshes(
     reader = ShapeReader(
         model, mesh_folders(urdf, package_dirs), str(urdf), notes, allow_faults=True, load=lambda *_: coal.Sphere(1.0)
     )
-    found = {piece.parentFrame for piece in reader.read(_root(urdf), "collision").geometryObjects}
+    frames = {piece.parentFrame for piece in reader.read(_root(urdf), "collision").geometryObjects}
     if visuals:
-        found |= {piece.parentFrame for piece in reader.read(_root(urdf), "visual", found).geometryObjects}
-    return [note for note in notes if note.kind is NoteKind.MESH], [model.frames[frame].name for frame in sorted(found)]
+        frames |= {piece.parentFrame for piece in reader.read(_root(urdf), "visual", frames).geometryObjects}
+    links = [model.frames[frame].name for frame in sorted(frames)]
+    return [note for note in notes if note.kind is NoteKind.MESH], links
 
 
 def mesh_names(urdf: Path, tag: str = "") -> list[str]:
