@@ -4,7 +4,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from qpavoid import ConfigError, NumericalError, Robot, simulate
+from qpavoid import ConfigError, NumericalError, Robot, load_scenario, simulate
 from qpavoid.config import Payload, PlantSettings, Push
 
 pytest.importorskip("mujoco")
@@ -119,3 +119,17 @@ def test_floor_carries_a_humanoid_that_is_locked_by_stiff_joints():
 def test_a_plant_needs_torques():
     with pytest.raises(ConfigError, match="dynamics"):
         simulate("panda_line", plant="mujoco")
+    with pytest.raises(ConfigError, match="dynamics"):
+        load_scenario("panda_line", ["plant={}"])
+
+
+def test_a_scenario_with_a_plant_is_played_on_it():
+    """A G1 begins to wave: its log has torques, forces that carry it, and feet at rest; without the plant none."""
+    log = simulate(load_scenario("g1_wave", ["duration=0.1"]))
+    figures = log.metrics()
+    assert log.torque.shape == (101, 29) and figures["status_counts"]["SOLVED"] == 101
+    weight = 9.81 * pin.computeTotalMass(Robot.load("g1").model)
+    assert log.contact_force[-1, :, 2].sum() == pytest.approx(weight, rel=0.05)
+    assert figures["torque"]["share"] < 1.0 and figures["torque"]["slip"] < 1e-3
+    exact = simulate(load_scenario("g1_wave", ["duration=0.01", "plant=null"]))
+    assert exact.metrics()["torque"] is None and not exact.slip.size

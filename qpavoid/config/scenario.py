@@ -10,6 +10,7 @@ from pydantic import Field, PrivateAttr, model_validator
 from qpavoid.config.base import Block, NonNegative, Number, Positive
 from qpavoid.config.control import Avoidance, Dynamics, Limits, Planning, Progress, Sensing
 from qpavoid.config.motion import Circle, Fixed, Line, Motion
+from qpavoid.config.plant import PlantSettings
 from qpavoid.config.shapes import HalfSpace, Mesh, ObstacleShape, PointCloud
 from qpavoid.config.solver import QpSolver, SolverConfig
 from qpavoid.config.tasks import AnyTask, Contact
@@ -80,6 +81,9 @@ class ScenarioConfig(Block):
     progress: Progress = Progress()
     dynamics: Dynamics | None = None
     """Torque level; left out, or `null`: what is commanded is a velocity."""
+    plant: PlantSettings | None = None
+    """Robot with torque motors in MuJoCo that the run is played on; left out, or `null`: what is commanded is followed
+    exactly."""
     planning: Planning | None = None
     """Forecasts and plans; left out, or `null`: none."""
     solver: SolverConfig = QpSolver()
@@ -112,6 +116,8 @@ class ScenarioConfig(Block):
         if self.duration / self.dt > _MAX_STEPS:
             steps = f"{self.duration / self.dt:.3g} control steps"
             raise ValueError(f"duration / dt is {steps}; at most {_MAX_STEPS} are run and logged")
+        if self.plant is not None and self.dynamics is None:
+            raise ValueError("plant: its motors take torques; give `dynamics`, or leave `plant` out")
         for clause, names in (
             ("obstacle", [o.name for o in self.obstacles]),
             ("task", [t.label for t in self.tasks]),

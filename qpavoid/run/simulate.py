@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 import pinocchio as pin
 
-from qpavoid.config import PlantSettings, ScenarioConfig
+from qpavoid.config import Contact, PlantSettings, ScenarioConfig
 from qpavoid.config.loading import load_scenario
 from qpavoid.control.latency import CommandsUnderWay
 from qpavoid.control.tick import Tick
@@ -45,7 +45,8 @@ def simulate(
         solver: replaces the scenario's solver, as in `eq10` or `qp:proxqp`.
         progress: called after each tick with the number done and the number in all.
         plant: robot with torque motors in MuJoCo, `mujoco` for one that is as its model; it needs a scenario with a
-            `dynamics` block. The log then has torques, and where contacts touch a floor, their forces and slip.
+            `dynamics` block. That of the scenario, if any, where it is left out. The log then has torques, and where
+            contacts touch a floor, their forces and slip.
 
     Raises:
         ConfigError, UnknownName, SolverNotInstalled: the scenario cannot be built, or MuJoCo is not installed.
@@ -55,21 +56,21 @@ def simulate(
     elif solver is not None:
         settings = parse_solver(solver, scenario.solver)
         scenario = scenario.model_copy(update={"solver": settings})
-    return run(scenario, None, progress, PlantSettings() if plant == "mujoco" else plant)
+    if plant is not None:
+        update = {"plant": PlantSettings() if plant == "mujoco" else plant}
+        scenario = scenario.model_copy(update=update)
+    return run(scenario, None, progress)
 
 
-def run(
-    scenario: ScenarioConfig,
-    robot: Robot | None,
-    progress: Callable[[int, int], None] | None = None,
-    plant: PlantSettings | None = None,
-) -> Log:
+def run(scenario: ScenarioConfig, robot: Robot | None, progress: Callable[[int, int], None] | None = None) -> Log:
     """Run a scenario, see `simulate`, with its robot if that is loaded already."""
     controller, q = Controller.from_scenario(scenario, robot)
     _check_start(controller, q, scenario)
     dt, ticks = scenario.dt, round(scenario.duration / scenario.dt) + 1
     follower = Follower(controller.scene.robot.model, q, scenario.latency, dt)
-    motors = None if plant is None else _make_plant(controller, q, plant, scenario)
+    motors = (
+        None if scenario.plant is None else make_plant(controller.scene.robot, q, scenario.plant, scenario.contacts)
+    )
     try:
         recorder = Recorder(controller, scenario, ticks, motors)
     except MemoryError:
@@ -82,7 +83,7 @@ def run(
             if motors is not None:
                 recorder.add(_play(controller, motors, k * dt))
             else:
-                tick = controller.tick(follower.q, k * dt, v=follower.v)
+                tick = controller.tick(follower.q, k * dt, v=follower.v, copy=False)
                 recorder.add(tick)
                 follower.follow(tick.solution.v)
             if progress is not None:
@@ -94,13 +95,17 @@ def run(
     return recorder.log(stopped_by)
 
 
-def _make_plant(controller: Controller, q: Array, settings: PlantSettings, scenario: ScenarioConfig) -> TorquePlant:
-    """Make a plant, at q (nq,), on the corners of its contacts; MuJoCo is loaded for it alone."""
+def make_plant(robot: Robot, q: Array, settings: PlantSettings, contacts: Sequence[Contact]) -> TorquePlant:
+    """Make a robot with torque motors, at q (nq,), on the corners of its contacts; MuJoCo is loaded for it alone.
+
+    Raises:
+        ConfigError: MuJoCo is not installed, or does not know a joint.
+    """
     from qpavoid.run.torque_plant import TorquePlant
 
-    points = [(contact.frame, np.array(contact.vertices or [(0.0, 0.0, 0.0)])) for contact in scenario.contacts]
+    points = [(contact.frame, np.array(contact.vertices or [(0.0, 0.0, 0.0)])) for contact in contacts]
     try:
-        return TorquePlant(controller.scene.robot, q, settings, points)
+        return TorquePlant(robot, q, settings, points)
     except ValueError as error:
         raise ConfigError(f"plant: {error}") from None
 
@@ -108,7 +113,7 @@ def _make_plant(controller: Controller, q: Array, settings: PlantSettings, scena
 def _play(controller: Controller, plant: TorquePlant, t: float) -> Tick:
     """Take a step at t [s] by what the plant measures, and return it with the state that was true."""
     state, (q, v) = State(plant.q, plant.v, t), plant.measure()
-    tick = controller.tick(q, t, v=v)
+    tick = controller.tick(q, t, v=v, copy=False)
     plant.follow(tick.solution, controller.dt)
     return tick._replace(state=state)
 

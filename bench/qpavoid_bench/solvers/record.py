@@ -59,7 +59,7 @@ def runs(every: int = 1) -> list[Run]:
         every: keep the QPs of every so many control steps only; warm starts get older with it.
     """
     shipped = [load_scenario(name) for name in shipped_names("scenario")]
-    scenarios = {each.source.stem: each for each in shipped if each.solver.name == "qp"}
+    scenarios = {each.source.stem: each for each in shipped if each.solver.name == "qp" and each.dynamics is None}
     scenarios["circling"] = circling(backup=None)
     scenarios["squeezed"] = load_scenario(str(Path(__file__).with_name("squeezed.yaml")))
     recorded = [*(_of_scenario(name, each, every) for name, each in scenarios.items()), _humanoid(every)]
