@@ -41,8 +41,6 @@ class RobotDynamics:
     """`DynamicsArrays` in compiled code, once `lay_out` was called."""
     contacts: ContactRows | None = None
     """Frames that rest, of a base that floats."""
-    resting: Contacts | None = None
-    """Contacts of the last step, at rest; None of a fixed base."""
 
     def __init__(
         self, robot: Robot, settings: config.Dynamics, bounds: JointBounds, dt: float, row_gain: float
@@ -156,6 +154,11 @@ class RobotDynamics:
         if self._settings.holding_fraction is not None:
             self._gravity_slope[:] = pin.computeGeneralizedGravityDerivatives(model, data, q)
             self._gravity[:] = data.g
+
+    @property
+    def resting(self) -> Contacts | None:
+        """Contacts of the last step, at rest; None of a fixed base."""
+        return None
 
     def solve(self, solver: Solver, problem: Problem) -> Solution:
         """Return the solution of a law."""

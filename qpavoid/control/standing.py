@@ -62,7 +62,6 @@ class StandingDynamics(RobotDynamics):
         self.contacts = self._contacts = contacts.own_copy()
         self._full, self._bias = np.zeros((n, n)), np.zeros(n)
         self._margin, self._center, self._center_jacobian = settings.support_margin, np.zeros(3), np.zeros((3, n))
-        self._x: RowLayout | None = None
         self._lay_points()
         if settings.observer is not None:
             raise ConfigError(
@@ -291,7 +290,6 @@ class StandingDynamics(RobotDynamics):
 
     def _limp(self, solution: Solution) -> Solution:
         """Return a stop by torques alone: those that hold gravity, and brake as far as limits allow."""
-        assert self._x is not None
         v = self._x.v_stop.copy()
         change = (v - self._x.v_prev) / self._dt
         torque = np.clip(self._M[BASE:] @ change + self._h[BASE:], -self.limit, self.limit)
