@@ -32,7 +32,9 @@ def talos():
         values = [float(value) for value in joint.get("value").split()]
         home[joint.get("name")] = values[0] if len(values) == 1 else values
     home.pop("root_joint")
-    return Robot.from_urdf(folder / "robots" / "talos_reduced.urdf", root_joint="free_flyer", bodies=[], home=home)
+    limits = {"velocity": {"root_joint": 10.0}}
+    urdf = folder / "robots" / "talos_reduced.urdf"
+    return Robot.from_urdf(urdf, root_joint="free_flyer", bodies=[], home=home, limits=limits)
 
 
 def ease(t, begin, end):
