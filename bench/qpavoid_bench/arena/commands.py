@@ -21,6 +21,7 @@ from qpavoid_bench.adapters import adapters
 from qpavoid_bench.camera import camera
 from qpavoid_bench.endurance.command import endurance
 from qpavoid_bench.grasps.command import grasps
+from qpavoid_bench.planning import planning
 from qpavoid_bench.serve import serve
 from qpavoid_bench.solvers.command import solvers
 from qpavoid_bench.survey import robots
@@ -49,7 +50,8 @@ app.command()(serve)
 app.command()(camera)
 app.command()(adapters)
 app.command()(grasps)
-_MEASURES = ("tick", "solvers", "endurance", "robots", "grasps", "serve", "camera", "adapters")
+app.command()(planning)
+_MEASURES = ("tick", "solvers", "endurance", "robots", "grasps", "serve", "camera", "adapters", "planning")
 """Commands that need none of the packages below."""
 
 _PACKAGES = ("distributed", "mujoco", "pandas", "statsmodels", "matplotlib")
