@@ -137,7 +137,7 @@ class StandingDynamics(RobotDynamics):
         code = kernels.direct(kernels.standing_step, packed, y, z, *arguments[:-1])
 
         def step(x: Any, q: Array, influence_distance: float, moving: bool, from_tasks: bool, measured: bool) -> int:
-            outcome, self._held = code(x, y, z, q, influence_distance, moving, from_tasks)
+            outcome, self._stance = code(x, y, z, q, influence_distance, moving, from_tasks)
             self._is_answered = self._is_settled = outcome == kernels.SETTLED
             return int(outcome)
 
@@ -154,33 +154,33 @@ class StandingDynamics(RobotDynamics):
     @property
     def resting(self) -> Contacts:
         """Contacts of the last step, at rest; a step approaches them at their rates, J v = (1 - κ_c) J v̄ + κ_c b."""
-        held = self._held
-        return Contacts(held.Z, held.resting, held.J, held.b)
+        stance = self._stance
+        return Contacts(stance.Z, stance.resting, stance.J, stance.b)
 
     @property
     def _approached(self) -> Contacts:
         """Contacts of the last step, as far as it approaches them."""
-        held = self._held
-        return Contacts(held.Z, held.approached, held.J, held.b_approached)
+        stance = self._stance
+        return Contacts(stance.Z, stance.approached, stance.J, stance.b_approached)
 
     def _contact_set(self, v_measured: Array) -> Contacts:
         """Return contacts and equations of the base as contacts of x = (v, s p)."""
-        held, M = self._held, self._full[:BASE]
-        n, m, c = len(self._bias), len(held.Jp), len(held.b)
+        stance, M = self._stance, self._full[:BASE]
+        n, m, c = len(self._bias), len(stance.Jp), len(stance.b)
         rows, right = np.zeros((c + BASE, n + m)), np.empty(c + BASE)
-        rows[:c, :n], right[:c] = held.J, held.b_approached
-        rows[c:, :n], rows[c:, n:] = M, -held.Jp[:, :BASE].T / _SCALE
+        rows[:c, :n], right[:c] = stance.J, stance.b_approached
+        rows[c:, :n], rows[c:, n:] = M, -stance.Jp[:, :BASE].T / _SCALE
         right[c:] = M @ v_measured - self._dt * self._bias[:BASE]
-        return Contacts(held.X, held.start, rows, right)
+        return Contacts(stance.X, stance.start, rows, right)
 
     def _hard_rows(self, v_measured: Array) -> StepDynamics:
         """Return the dynamics of x = (v, s p), with the rows of torque limits and cones."""
-        held, m = self._held, len(self._held.Jp)
-        M = np.hstack((self._full, -held.Jp.T / _SCALE))
+        stance, m = self._stance, len(self._stance.Jp)
+        M = np.hstack((self._full, -stance.Jp.T / _SCALE))
         v = np.concatenate((v_measured, np.zeros(m)))
-        points = tuple(self._contacts.settings[i].frame for i in self._owners[held.used])
+        points = tuple(self._contacts.settings[i].frame for i in self._owners[stance.used])
         return StepDynamics(
-            M, self._bias, v, self._dt, self.actuated, self.limit, held.rows, held.rhs, held.hard, points
+            M, self._bias, v, self._dt, self.actuated, self.limit, stance.rows, stance.rhs, stance.hard, points
         )  # fmt: skip
 
     def rows(self, v_measured: Array) -> StepDynamics | None:
@@ -196,13 +196,13 @@ class StandingDynamics(RobotDynamics):
 
     def _with_impulses(self, v: Array) -> Array:
         """Return x = (v, s p) of a velocity (nv,) that meets the contacts, see `kernels.with_impulses`."""
-        return np.asarray(kernels.with_impulses(self._packed_z, self._held, self._x.v_prev, self._dt, v))
+        return np.asarray(kernels.with_impulses(self._packed_z, self._stance, self._x.v_prev, self._dt, v))
 
     def solve(self, solver: Solver, problem: Problem) -> Solution:
         """Return the solution of a law, of the problem in x = (v, s p)."""
-        if not self._held.is_held or not np.isfinite(problem.v_tracking).all():
+        if not self._stance.is_held or not np.isfinite(problem.v_tracking).all():
             return Solution(problem.v_stop.copy(), Status.STOPPED, (_not_held(),))
-        n, m = len(self._bias), len(self._held.Jp)
+        n, m = len(self._bias), len(self._stance.Jp)
         solution = solver.solve(self._full_problem(problem))
         if solution.v.shape == (n + m,):
             self._take(solution.v)
@@ -219,7 +219,7 @@ class StandingDynamics(RobotDynamics):
 
     def _full_problem(self, problem: Problem) -> Problem:
         """Return a problem in v as one in x = (v, s p)."""
-        m, v_measured = len(self._held.Jp), self._x.v_prev
+        m, v_measured = len(self._stance.Jp), self._x.v_prev
         far = np.full(m, np.inf)
 
         def padded(J: Array) -> Array:
@@ -249,7 +249,7 @@ class StandingDynamics(RobotDynamics):
         """Return the solution with acceleration, torques and forces.
 
         A velocity that is not the law's, as of a stop, is replaced by the nearest one that torques and cones allow.
-        Where there is none, the joints brake as their torques allow, with gravity held, and the step is a stop.
+        Where there is none, the joints brake as their torques allow, with gravity stance, and the step is a stop.
 
         Args:
             solution: what is decided.
@@ -257,12 +257,12 @@ class StandingDynamics(RobotDynamics):
             names: of all nv coordinates.
             units: their units, rad or m.
         """
-        n, m, y, z = len(self._bias), len(self._held.Jp), self._arrays, self._z
+        n, m, y, z = len(self._bias), len(self._stance.Jp), self._arrays, self._z
         if not (self._is_answered and np.array_equal(z.solved[:n], solution.v)) and not self._nearest(solution.v):
             return self._limp(solution)
         if not self._is_settled:
-            kernels.standing_torques(self.packed, self._packed_z, self._held, v_measured, self._dt)
-        forces, owners = z.solved[n : n + m].reshape(-1, 3) / self._dt, self._owners[self._held.used]
+            kernels.standing_torques(self.packed, self._packed_z, self._stance, v_measured, self._dt)
+        forces, owners = z.solved[n : n + m].reshape(-1, 3) / self._dt, self._owners[self._stance.used]
         by_frame = {
             contact.frame: forces[owners == i]
             for i, contact in enumerate(self._contacts.settings)
@@ -274,12 +274,12 @@ class StandingDynamics(RobotDynamics):
 
     def _nearest(self, v: Array) -> bool:
         """Take the velocity nearest to v (nv,) that torques and cones allow; return whether there is one."""
-        if not (held := self._held).is_held:
+        if not (stance := self._stance).is_held:
             return False
-        n, X, start = len(v), held.X, held.start
+        n, X, start = len(v), stance.X, stance.start
         target = X.T @ (self._with_impulses(self._approached.project(v)) - start)
         free = np.full(X.shape[1], np.inf)
-        rows, rhs = held.rows[: held.hard], held.rhs[: held.hard]
+        rows, rhs = stance.rows[: stance.hard], stance.rhs[: stance.hard]
         J, b = np.ascontiguousarray(rows @ X), rhs - rows @ start
         y, is_solved = kernels.project(
             np.ascontiguousarray(X[:n]), _VELOCITY_WEIGHT, target, J, b, -free, free

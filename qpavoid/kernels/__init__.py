@@ -46,7 +46,8 @@ from qpavoid.kernels.ramps import RampLimits, follow_ramp, velocity_towards
 from qpavoid.kernels.rollout import RolloutArrays, advance_rollout, begin_rollout, offset_of_start, rollout_outcome
 from qpavoid.kernels.rotation import rotation_vector
 from qpavoid.kernels.rows import alpha, beta, distance_rows, row_bounds
-from qpavoid.kernels.standing import Held, StandingArrays, standing_step, standing_torques, with_impulses
+from qpavoid.kernels.standing import standing_step, standing_torques, with_impulses
+from qpavoid.kernels.standing_layout import Stance, StandingArrays
 from qpavoid.kernels.step import (
     SETTLED,
     TO_MEASURE,
@@ -74,7 +75,6 @@ __all__ = [
     "DistanceArrays",
     "DynamicsArrays",
     "FrameTargets",
-    "Held",
     "KinematicsArrays",
     "ObstacleArrays",
     "OwnBodies",
@@ -84,6 +84,7 @@ __all__ = [
     "RampLimits",
     "RolloutArrays",
     "RowLayout",
+    "Stance",
     "StandingArrays",
     "add_curvature",
     "advance_rollout",

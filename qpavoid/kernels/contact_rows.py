@@ -66,7 +66,7 @@ def contact_rows(
             J[r], b[r], owners[r] = own[a], gains[i] * missing, i
             largest = max(largest, abs(b[r]))
             r += 1
-    share = min(1.0, _CORRECTION / largest)
+    fraction = min(1.0, _CORRECTION / largest)
     for r in range(count):
-        b[r] *= share
+        b[r] *= fraction
     return J, b, owners

@@ -5,7 +5,7 @@ See `contact_forces` for what is eliminated, and `control.standing` for what it 
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -25,102 +25,17 @@ from qpavoid.kernels.dynamics_rows import admit_stop, approached_rows, scale_bra
 from qpavoid.kernels.orthogonal import factorise_rows, least_solution
 from qpavoid.kernels.packing import compiled
 from qpavoid.kernels.reduced_qp import project_within
+from qpavoid.kernels.standing_layout import Stance
 from qpavoid.kernels.step import SETTLED, UNSETTLED, is_too_near, tracking_violation, violation
 from qpavoid.kernels.tasks import frame_rows
 from qpavoid.kernels.tracking_law import tracking_law
-from qpavoid.problem import CONTACT_TOLERANCE, Array, IntArray, Mask
-
-
-class StandingArrays(NamedTuple):
-    """Memory of a robot that stands: n coordinates, f contacts, k contact points."""
-
-    mass: Array
-    """(n, n) mass matrix; its upper triangle is read, the lower one written."""
-    bias: Array
-    """(n,) Coriolis, centrifugal and gravity torques [Nm or N]."""
-    frame_ids: IntArray
-    """(f,) frames in contact."""
-    support: Array
-    """(f, e) 1 of the columns that move each frame, else 0."""
-    anchors: Array
-    """(f, 12) poses at which they rest: rotation by columns, then position [m]."""
-    gains: Array
-    """(f,) feedback on what has slid [1/s]."""
-    surfaces: Mask
-    """(f,) whether it may not turn, either."""
-    shares: Array
-    """(f,) how far each bears what it may; 0 off the ground [-]."""
-    leaves: Mask
-    """(f,) whether it is about to leave."""
-    steps: Array
-    """(f,) κ_c: part of the way to rest that one step makes [-]."""
-    normals: Array
-    """(f, 3) direction in the frame in which the ground pushes, of length 1."""
-    friction: Array
-    """(f,) μ."""
-    force: Array
-    """(f, 2) least and largest normal force of each point [N]."""
-    points: Array
-    """(k, 3) contact points, in their frames [m]."""
-    owners: IntArray
-    """(k,) contact of each point."""
-    weight: Array
-    """(1,) of the robot [N]."""
-    center: Array
-    """(3,) centre of mass, world [m]."""
-    center_jacobian: Array
-    """(3, n) its Jacobian."""
-    jacobians: Array
-    """(f, 6, n) scratch: Jacobians of the frames."""
-    solved: Array
-    """(n + 3 k,) out: (v, p) of a settled step, with p in N s."""
-    support_margin: float
-    """Least distance of the capture point to the edges of the support [m]; negative: none is kept."""
-    scale: float
-    """s: what an impulse of 1 N s counts beside velocities."""
-
-
-class Held(NamedTuple):
-    """What contacts and base leave in a step: c rows, m = 3 impulses of each active point; see `eliminate_base`."""
-
-    J: Array
-    """(c, n) rows of the contacts."""
-    b: Array
-    """(c,) velocity that brings them to where they rest [m/s, rad/s]."""
-    b_approached: Array
-    """(c,) the part of it that this step makes, from the measured velocity on."""
-    Z: Array
-    """(n, ·) basis of what they leave."""
-    resting: Array
-    """(n,) least v with J v = b."""
-    approached: Array
-    """(n,) least v with J v = b_approached."""
-    used: IntArray
-    """(m / 3,) active points, by number."""
-    Jp: Array
-    """(m, n) Jacobian of these points."""
-    normals: Array
-    """(m / 3, 3) direction in which the ground pushes, world."""
-    X: Array
-    """(n + m, ·)."""
-    start: Array
-    """(n + m,)."""
-    Y: Array
-    """(m, 6)."""
-    rows: Array
-    """(t + 2 m + e, n + m) of torque limits, then cones, then balance, in x = (v, s p)."""
-    rhs: Array
-    """(t + 2 m + e,)."""
-    hard: int
-    """How many of the rows are never relaxed: all but those of balance."""
-    is_held: bool
-    """Whether the points can carry any wrench; else what is about impulses is not written."""
+from qpavoid.problem import CONTACT_TOLERANCE, Array, IntArray
 
 
 @compiled
 def standing_step(
     x: Any, y: Any, z: Any, q: Array, influence_distance: float, moving: bool, from_tasks: bool
-) -> tuple[int, Held]:
+) -> tuple[int, Stance]:
     """Compute a control step of a robot that stands; see `dynamics_step`.
 
     Args:
@@ -136,46 +51,46 @@ def standing_step(
         SETTLED where z.solved may be commanded as it is, UNSETTLED where other laws and checks decide; and what
         contacts and base leave.
     """
-    held, s = stand(x, y, z), x.summary[0]
+    stance, s = stand(x, y, z), x.summary[0]
     scale_braking(x, y)
     margin, bent = velocity_bounds(x, q), 0.0
     admit_stop(x, y)
     if from_tasks:
         frame_rows(x)
-        bent = _track_within(x, held)
+        bent = _track_within(x, stance)
         if x.task_switching:
             bent = 0.0
     else:
-        _meet(held.J, held.b, held.Z, held.resting, x.v_tracking, CONTACT_TOLERANCE)
+        _meet(stance.J, stance.b, stance.Z, stance.resting, x.v_tracking, CONTACT_TOLERANCE)
     k = approached_rows(x, y, influence_distance, moving)
     if y.approaches[0]:
         for j in range(len(x.v_prev)):
             x.v_tracking[j] = x.v_prev[j] + y.tracking_factor * (x.v_tracking[j] - x.v_prev[j])
         tolerance = 0.0 if from_tasks else CONTACT_TOLERANCE
-        _meet(held.J, held.b_approached, held.Z, held.approached, x.v_tracking, tolerance)
+        _meet(stance.J, stance.b_approached, stance.Z, stance.approached, x.v_tracking, tolerance)
     worst = tracking_violation(x, k)
     s.rows, s.violation, s.is_clear, s.position_margin, s.bent = k, worst, False, margin, bent
-    if x.regularization == 0.0 or not held.is_held or margin < -OUTSIDE or is_too_near(x, k):
-        return UNSETTLED, held
-    code = _solve(x, z, held, k, from_tasks, max(x.regularization, bent))
+    if x.regularization == 0.0 or not stance.is_held or margin < -OUTSIDE or is_too_near(x, k):
+        return UNSETTLED, stance
+    code = _solve(x, z, stance, k, from_tasks, max(x.regularization, bent))
     if code == SETTLED:
-        standing_torques(y, z, held, x.v_prev, x.dt)
-    return code, held
+        standing_torques(y, z, stance, x.v_prev, x.dt)
+    return code, stance
 
 
 @compiled
-def _solve(x: Any, z: Any, held: Any, k: int, from_tasks: bool, regularization: float) -> int:
+def _solve(x: Any, z: Any, stance: Any, k: int, from_tasks: bool, regularization: float) -> int:
     """Write v and z.solved: the tracked velocity with impulses, or the QP in what contacts and base leave."""
-    n, m, used = len(x.v_prev), len(held.Jp), len(held.rhs)
+    n, m, used = len(x.v_prev), len(stance.Jp), len(stance.rhs)
     lower, upper = np.full(n + m, -np.inf), np.full(n + m, np.inf)
     G, g = np.zeros((k + used, n + m)), np.empty(k + used)
     lower[:n], upper[:n] = x.lower, x.upper
     G[:k, :n], g[:k] = x.J[:k], x.rhs[:k]
-    G[k:], g[k:] = held.rows, held.rhs
-    tracked = with_impulses(z, held, x.v_prev, x.dt, x.v_tracking)
+    G[k:], g[k:] = stance.rows, stance.rhs
+    tracked = with_impulses(z, stance, x.v_prev, x.dt, x.v_tracking)
     if not violation(tracked, G, g, lower, upper) <= 0.0:
         A = x.A if from_tasks else x.identity
-        tracked, is_solved = project_within(A, regularization, tracked, held.X, held.start, G, g, lower, upper)
+        tracked, is_solved = project_within(A, regularization, tracked, stance.X, stance.start, G, g, lower, upper)
         if not is_solved:
             return UNSETTLED
     x.v[:] = tracked[:n]
@@ -186,7 +101,7 @@ def _solve(x: Any, z: Any, held: Any, k: int, from_tasks: bool, regularization: 
 
 
 @compiled
-def stand(x: Any, y: Any, z: Any) -> Held:
+def stand(x: Any, y: Any, z: Any) -> Stance:
     """Take up contacts and base, for a step from the measured velocity.
 
     Args:
@@ -231,7 +146,7 @@ def stand(x: Any, y: Any, z: Any) -> Held:
     else:
         y.M[:BASE], y.h[:BASE] = 0.0, 0.0
         y.M[BASE:], y.h[BASE:] = z.mass[BASE:], z.bias[BASE:]
-    return Held(J, b, approaching, Z, resting, approached, used, Jp, normals, X, start, Y, rows, rhs, hard, is_held)
+    return Stance(J, b, approaching, Z, resting, approached, used, Jp, normals, X, start, Y, rows, rhs, hard, is_held)
 
 
 @compiled
@@ -245,11 +160,11 @@ def _points(x: Any, z: Any) -> tuple[IntArray, Array, Array, Array, Array, Array
     friction, least, most, at = np.empty(count), np.empty(count), np.empty(count), 0
     for k in range(len(z.owners)):
         owner = z.owners[k]
-        share, pose = z.shares[owner], x.frame_poses[z.frame_ids[owner]]
-        if not share > 0.0:
+        fraction, pose = z.shares[owner], x.frame_poses[z.frame_ids[owner]]
+        if not fraction > 0.0:
             continue
         used[at], owners[at], friction[at] = k, owner, z.friction[owner]
-        least[at], most[at] = z.force[owner, 0] if share == 1.0 else 0.0, z.force[owner, 1] * share
+        least[at], most[at] = z.force[owner, 0] if fraction == 1.0 else 0.0, z.force[owner, 1] * fraction
         for i in range(3):
             offsets[at, i] = normals[at, i] = 0.0
             for c in range(3):
@@ -277,9 +192,9 @@ def _bearing_points(x: Any, z: Any, used: IntArray) -> Array:
 
 
 @compiled
-def _track_within(x: Any, held: Any) -> float:
+def _track_within(x: Any, stance: Any) -> float:
     """Let the tracking law hold the contacts; return how far the task rows bend."""
-    (rows, n), Z, resting = x.A.shape, held.Z, held.resting
+    (rows, n), Z, resting = x.A.shape, stance.Z, stance.resting
     A, missing, inner = np.zeros((rows, n)), x.b.copy(), np.empty(Z.shape[1])
     for r in range(rows):
         inner[:] = 0.0
@@ -322,17 +237,17 @@ def _meet(J: Array, b: Array, Z: Array, least: Array, v: Array, tolerance: float
 
 
 @compiled
-def standing_torques(y: Any, z: Any, held: Any, v_measured: Array, dt: float) -> None:
+def standing_torques(y: Any, z: Any, stance: Any, v_measured: Array, dt: float) -> None:
     """Write acceleration and torques, cut at their limits, of the velocity and impulses of z.solved.
 
     Args:
         y: `DynamicsArrays`; reads limit, writes change and torque.
         z: `StandingArrays`.
-        held: of the step.
+        stance: of the step.
         v_measured: v̄ (n,).
         dt: control period [s].
     """
-    n, m = len(v_measured), len(held.Jp)
+    n, m = len(v_measured), len(stance.Jp)
     for j in range(n):
         y.change[j] = (z.solved[j] - v_measured[j]) / dt
     for r in range(n - BASE):
@@ -340,36 +255,36 @@ def standing_torques(y: Any, z: Any, held: Any, v_measured: Array, dt: float) ->
         for j in range(n):
             torque += z.mass[BASE + r, j] * y.change[j]
         for j in range(m):
-            torque -= held.Jp[j, BASE + r] * z.solved[n + j] / dt
+            torque -= stance.Jp[j, BASE + r] * z.solved[n + j] / dt
         y.torque[r] = min(max(torque, -y.limit[r]), y.limit[r])
 
 
 @compiled
-def with_impulses(z: Any, held: Any, v_measured: Array, dt: float, v: Array) -> Array:
+def with_impulses(z: Any, stance: Any, v_measured: Array, dt: float, v: Array) -> Array:
     """Compute x = (v, s p) of a velocity that meets the contacts: with the p nearest to equal shares of the weight.
 
     p = p̂ + Y (M_b (v - v̄) + dt h_b - B p̂), as Y is the least right inverse of B.
 
     Args:
         z: `StandingArrays`.
-        held: of the step.
+        stance: of the step.
         v_measured: v̄ (n,).
         dt: control period [s].
         v: (n,).
     """
-    n, m, Jp = len(v), len(held.Jp), held.Jp
+    n, m, Jp = len(v), len(stance.Jp), stance.Jp
     out, equal = np.empty(n + m), dt * z.weight[0] / (m // 3)
     out[:n] = v
     for j in range(m):
-        out[n + j] = equal * held.normals[j // 3, j % 3]
+        out[n + j] = equal * stance.normals[j // 3, j % 3]
     for i in range(BASE):
         needed = dt * z.bias[i]
         for j in range(n):
             needed += z.mass[i, j] * (v[j] - v_measured[j])
         for j in range(m):
-            needed -= Jp[j, i] * equal * held.normals[j // 3, j % 3]
+            needed -= Jp[j, i] * equal * stance.normals[j // 3, j % 3]
         for j in range(m):
-            out[n + j] += held.Y[j, i] * needed
+            out[n + j] += stance.Y[j, i] * needed
     for j in range(m):
         out[n + j] *= z.scale
     return out

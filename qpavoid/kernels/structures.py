@@ -17,7 +17,7 @@ from qpavoid.kernels.near_pairs import DistanceArrays
 from qpavoid.kernels.packing import compiled
 from qpavoid.kernels.planning import PlanningArrays
 from qpavoid.kernels.rollout import RolloutArrays
-from qpavoid.kernels.standing import StandingArrays
+from qpavoid.kernels.standing_layout import StandingArrays
 
 
 class _Structure(types.StructRef):  # type: ignore[misc]
