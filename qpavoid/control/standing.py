@@ -216,9 +216,14 @@ class StandingDynamics(RobotDynamics):
         return np.concatenate((v, _SCALE * (self._Y @ needed + self._N @ (self._N.T @ equal))))
 
     def solve(self, solver: Solver, problem: Problem) -> Solution:
-        """Return the solution of a law, of the problem in x = (v, s p)."""
+        """Return the solution of a law, of the problem in x = (v, s p); of one that holds no contacts, in v.
+
+        `command` then finds the nearest velocity that torques and cones allow.
+        """
         if not self._is_held or not np.isfinite(problem.v_tracking).all():
             return Solution(problem.v_stop.copy(), Status.STOPPED, (_not_held(),))
+        if not solver.holds_contacts:
+            return solver.solve(problem)
         n, m = len(self._v), len(self._Jp)
         solution = solver.solve(self._full_problem(problem))
         if solution.v.shape == (n + m,):
