@@ -25,8 +25,7 @@ from qpavoid_bench.arena.scores import COLUMNS
 from qpavoid_bench.arena.statistics import duel, mean, median, pareto, ranks, rate
 from qpavoid_bench.arena.store import Store
 from qpavoid_bench.arena.tables import COLUMNS as SHOWN
-from qpavoid_bench.arena.tables import MOTORS
-from qpavoid_bench.arena.tables import MORE
+from qpavoid_bench.arena.tables import MORE, MOTORS
 
 flags = st.lists(st.booleans(), min_size=1, max_size=30)
 
@@ -300,7 +299,7 @@ def test_report_counts_failures():
 def test_report_units():
     """A column's scale is that from the unit of the score to the unit of its heading."""
     score_units = {"[mm]": ("[m]", 1e3), "[%]": ("", 100.0), "[µs]": ("[µs]", 1.0)}
-    for column in (*SHOWN, *MORE):
+    for column in (*SHOWN, *MORE, *MOTORS):
         unit = re.search(r"\[.*\]", column.heading)[0]
         assert column.name in COLUMNS
         assert column.scale == score_units.get(unit, (unit, 1.0))[1], column.heading

@@ -33,7 +33,7 @@ class Body(Protocol):
     has_fallen: bool
 
     def measure(self) -> tuple[Array, Array | None]:
-        """Return configuration (nq,) and velocity (nv,) as measured; None where nobody needs to know it."""
+        """Return configuration (nq,) and velocity (nv,) as measured; None where it is as commanded."""
         ...
 
     def follow(self, solution: Solution | None, dt: float) -> None:
@@ -51,7 +51,7 @@ class ExactBody:
         self.q, self.v, self.torque, self.torque_limit = q, np.zeros(robot.model.nv), np.zeros(0), np.zeros(0)
 
     def measure(self) -> tuple[Array, Array | None]:
-        """Return the configuration; nobody needs to measure the velocity that was commanded."""
+        """Return the configuration; the velocity is as commanded."""
         return self.q.copy(), None
 
     def follow(self, solution: Solution | None, dt: float) -> None:
