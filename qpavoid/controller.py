@@ -158,8 +158,7 @@ class Controller(SceneChanges, SplitStep):
             self.add_obstacle(passing)
             self.tick(q, v=v)
             self.remove_obstacle(_WARM_UP)
-        for query in self._builder.rows.query.table.queries:
-            query.forget_guesses()
+        self._builder.rows.query.table.forget_guesses()
         self._arbiter.solver = law
         self.reset()
 
@@ -228,8 +227,14 @@ class Controller(SceneChanges, SplitStep):
             NumericalError: an argument of the wrong shape, or not made of numbers.
             UnknownName: of a target or obstacle.
         """
-        begin = perf_counter()
-        return self._decide(self._builder.build(self._builder.read(q, t, targets, obstacles, v)), begin)
+        begin, builder = perf_counter(), self._builder
+        step = builder.begin(q, t, targets, obstacles, v)
+        if step.is_plain and self._planning is None and self._arbiter.accepts(step.t):
+            middle, v = perf_counter(), builder.rows.v.copy()
+            builder.remember(v)
+            solution = Solution.solved(v, middle - begin, perf_counter() - middle)
+            return solution._replace(assumptions=step.assumptions) if step.assumptions else solution
+        return self._decide(step, begin)
 
     def tick(
         self,
@@ -238,17 +243,18 @@ class Controller(SceneChanges, SplitStep):
         targets: Mapping[str, Any] | None = None,
         obstacles: Obstacles = None,
         v: Array | None = None,
+        copy: bool = True,
     ) -> Tick:
-        """Like `step`, with everything that led to the velocity."""
-        begin = perf_counter()
-        rows, step = self._builder.rows, self._builder.build(self._builder.read(q, t, targets, obstacles, v))
-        state, problem = State(step.q.copy(), rows.previous.v.copy(), step.t), rows.problem()
+        """Like `step`, with everything that led to the velocity; without `copy`, until the next step overwrites it."""
+        begin, builder, rows = perf_counter(), self._builder, self._builder.rows
+        step = builder.begin(q, t, targets, obstacles, v)
+        state, problem = State(step.q, rows.previous.v.copy(), step.t), rows.problem()
         solution = self._decide(step, begin)
-        return Tick(
-            state, tuple(step.targets), rows.task_errors.copy(), copied(rows.kinematics), copied(rows.proximity()),
-            copied(problem), solution, self._builder.obstacle_poses(step.q),
-            self.dt * self._arbiter.backup_velocities,
+        tick = Tick(
+            state, tuple(step.targets), rows.task_errors, rows.kinematics, rows.proximity(), problem, solution,
+            builder.obstacle_poses(step.q), self.dt * self._arbiter.backup_velocities,
         )  # fmt: skip
+        return copied(tick) if copy else tick
 
     def filter(
         self,

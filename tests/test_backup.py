@@ -6,7 +6,7 @@ import pytest
 from closed_loop import SHIPPED, Ruler, cartesian, changed, make_controller
 
 from qpavoid import Avoidance, Controller, Limits, Obstacle, ReasonKind, Sample, Status, load_scenario
-from qpavoid.config import Box, Line, Sphere
+from qpavoid.config import Box, Circle, Line, Sphere
 from qpavoid.model.trajectory import build_motion
 from qpavoid.safety.rollout import BackupRollouts
 
@@ -101,6 +101,17 @@ def test_without_backup_they_trap_the_robot(tmp_path, filtered):
         rest = (lambda q, t, c=controller: c.filter(q, np.zeros(2), t)) if filtered else None
         states = {k: q for k, (q, _) in enumerate(loop(controller, 300, step=rest))}
         assert (gaps(controller, states).min() < 0.0) == (not backup)
+
+
+@pytest.mark.parametrize(("at", "rate"), [(0.5, 1.0), (0.8, 1.8)])
+def test_an_obstacle_on_a_circle_is_evaded_though_only_samples_tell_of_it(tmp_path, at, rate):
+    """A ball of 0.3 m comes round through the origin; predicted on straight lines, it touches: by 42 and 256 mm."""
+    motion = Circle(center=(0, at, 0), radius=at, period=2 * np.pi / rate, normal=(0, 0, 1), start_direction=(0, 1, 0))
+    ball = Obstacle("ball", Sphere(radius=0.3), build_motion(motion, None, SHIPPED.parent), True)
+    controller = controller_of(tmp_path, [ball])
+    states = loop(controller, 400, external=True)
+    least = min(np.linalg.norm(q - ball.motion.sample(k * DT).position[:2]) for k, (q, _) in enumerate(states))
+    assert least - 0.3 - 0.05 > 0.9 * KEPT
 
 
 # --- a press with one exit -----------------------------------------------------------------------------------------

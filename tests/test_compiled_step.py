@@ -5,7 +5,7 @@ import pinocchio as pin
 import pytest
 from conftest import SPHERE, frames, obstacle
 
-from qpavoid import Avoidance, Controller, Sample, build_scene, build_tasks
+from qpavoid import Avoidance, Controller, Pose, Sample, build_scene, build_tasks
 from qpavoid.config import QpSolver, Task
 from qpavoid.solvers.qp import Qp
 
@@ -90,3 +90,26 @@ def test_a_tick_has_the_problem_that_was_solved(panda):
         assert tick.solution.reasons or (rows.J @ v >= rows.b - 1e-6).all()
         assert (v >= tick.problem.lower - 1e-9).all() and (v <= tick.problem.upper + 1e-9).all()
         q = pin.integrate(panda.model, q, DT * v)
+
+
+def test_plain_arguments_take_a_shorter_way_to_the_same_step(panda):
+    """Lists and numbers of another type are read one by one, arrays and floats in one call: bit for bit the same.
+
+    With an obstacle that is given, NaN, rotations to be normalised, a measured velocity and a gap in time among them.
+    """
+    one, other = controllers(panda, Avoidance())[0], controllers(panda, Avoidance())[0]
+    q, v, t = panda.home.copy(), np.zeros(panda.model.nv), 0.0
+    for k in range(STEPS):
+        t += 2.0 if k == 180 else DT
+        given = q.copy()
+        given[3] = np.nan if k == 60 else given[3]
+        goal = target(panda, k)
+        if k == 90:
+            goal = Sample.at(goal.position, np.round(goal.rotation + 3e-4, 4))
+        balls = {"ball1": Pose.at([0.3, -0.4 + 0.002 * k, 0.5])} if k > 120 else None
+        measured = v if k % 3 == 0 else None
+        short = one.step(given, t, {TOOL: goal}, balls, measured)
+        long = other.step(list(given), np.float64(t), {TOOL: goal}, balls, None if measured is None else list(v))
+        np.testing.assert_array_equal(short.v, long.v)
+        assert_same(short, long)
+        q, v = pin.integrate(panda.model, q, short.v * DT), short.v

@@ -48,7 +48,7 @@ def make_controller(robot, solver="qp", friction=0.5, contacts=None, priorities=
     tasks = [
         Task(frame=HAND, gain=3.0, priority=priorities[1]),
         Task(frame="pelvis", type="orientation", orientation_weight=0.3, gain=3.0, priority=priorities[0]),
-        ComTask(gain=3.0, priority=priorities[0]),
+        ComTask(gain=3.0, weight=10.0, priority=priorities[0]),  # balance first: a heel that lifts is a foot that slips
         PostureTask(weight=0.01, gain=2.0, priority=priorities[1]),
     ]
     ball = Obstacle.at("ball", Sphere(radius=0.06), [0.3, -1.0, 0.12])
@@ -209,7 +209,7 @@ def test_a_ball_crosses_the_waving_hand(g1, controller):
 def test_masses_that_are_off(g1, controller, mass_scale):
     controller.reset()
     run = play(g1, controller, 4.0, label=f"masses {mass_scale}", mass_scale=mass_scale)
-    assert not run.has_fallen and run.closest >= 0.0145 and run.slip < 1.3e-3
+    assert not run.has_fallen and run.closest >= 0.0145 and run.slip < 1e-3
 
 
 @pytest.mark.slow
@@ -223,7 +223,7 @@ def test_a_push(g1, controller):
     controller.reset()
     push = Push(frame="pelvis", force=(0.0, 60.0, 0.0), start=3.2)
     run = play(g1, controller, 4.0, label="60 N", pushes=[push])
-    assert not run.has_fallen and run.closest >= 0.0145 and run.slip < 5e-3
+    assert not run.has_fallen and run.closest >= 0.0145 and run.slip < 3e-3
 
 
 @pytest.mark.slow

@@ -30,8 +30,6 @@ class _Form(NamedTuple):
 
     layout: RowLayout
     packed: Any
-    step: Callable[..., int]
-    """Code of `kernels.control_step` for this memory."""
     views: dict[int, tuple[Proximity, AvoidanceRows]]
     """What there is of k near pairs, by k."""
 
@@ -88,16 +86,19 @@ class RowAssembler(TrackedVelocities):
         self.frame_count, self.tasks = len(frames), (*frames, *row_tasks)
         """Tasks in the order of `in_order`; the first `frame_count` are frames."""
         self._b_feasible = np.zeros(len(x.b))
-        self._is_compiled = self._forward.is_compiled and self.query.is_compiled and not row_tasks and contacts is None
+        self.is_compiled = self._forward.is_compiled and self.query.is_compiled and not row_tasks and contacts is None
+        """Whether a step at velocity level is one compiled call, but for pairs whose cores meet."""
         self._finds_pairs = self._forward.is_compiled and not self.query.has_clouds
         self.q: Array = scene.robot.home.copy()
         """Configuration (nq,) of the last step."""
         self.v = x.v
         """Velocity (nv,) that may be commanded, where `compute` says so; the next step overwrites it."""
-        self._follows_tasks = True
+        self.follows_tasks = True
+        """Whether the step is of the tasks, or of a velocity that is given."""
         self._contact_rows: Contacts | None = None
         self._find = kernels.direct(kernels.find_near_pairs, self._packed, self.q)
-        self._forms = [self._make_form(x)]
+        self._forms = [_Form(x, self._packed, {})]
+        self._step = self._load_step()
         self.use_form(0)
         self.kinematics = Kinematics(x.J_world, x.poses)
         """World Jacobian and poses of the tracked frames in this step."""
@@ -119,7 +120,8 @@ class RowAssembler(TrackedVelocities):
                 numbers["regularization"] = 0.0
             self.dynamics.approaches[0] = self._approaches = law.bounded
         if numbers != {name: getattr(self._layout, name) for name in numbers}:
-            self._forms = [self._make_form(form.layout._replace(**numbers)) for form in self._forms]
+            layouts = [form.layout._replace(**numbers) for form in self._forms]
+            self._forms = [_Form(layout, kernels.pack(layout), {}) for layout in layouts]
             self.use_form(0)
 
     def add_dampers(self, row_gain: float, margin: float, gain: float = 0.0) -> int:
@@ -137,21 +139,20 @@ class RowAssembler(TrackedVelocities):
         dampers = x._replace(
             row_gain=row_gain, near_speed=np.inf, task_switching=False, d1=x.d1 + margin, gain=gains, dead_beat=near_one
         )
-        self._forms.append(self._make_form(dampers))
+        self._forms.append(_Form(dampers, kernels.pack(dampers), {}))
         return len(self._forms) - 1
 
     def use_form(self, number: int) -> None:
         """Choose the form of the rows of the next steps; 0 is that of the settings."""
-        self._layout, self._packed, self._step, self._views = self._forms[number]
+        self._layout, self._packed, self._views = self._forms[number]
         self._row_count = self._layout.summary.view(np.ndarray)["rows"]
 
-    def _make_form(self, layout: RowLayout) -> _Form:
-        """Pack a layout."""
-        packed = kernels.pack(layout)
-        arguments = packed, self.q, self.influence_distance, False, True, False
+    def _load_step(self) -> Callable[..., int]:
+        """Return the code of `kernels.control_step` for all forms, which runs once now: it leaves guesses behind."""
+        arguments = self._packed, self.q, self.influence_distance, False, True, False
         if self.dynamics is not None:
-            return _Form(layout, packed, self.dynamics.step(*arguments), {})
-        return _Form(layout, packed, kernels.direct(kernels.control_step, *arguments), {})
+            return self.dynamics.step(*arguments)
+        return kernels.direct(kernels.control_step, *arguments)
 
     def compute(self, q: Array, targets: Sequence[Any], v_desired: Array | None = None) -> bool:
         """Compute distances, rows and bounds at a configuration, with the obstacles as placed.
@@ -164,19 +165,14 @@ class RowAssembler(TrackedVelocities):
         Returns:
             Whether `v` is what the law and the stop look-ahead lead to; else they have to see `problem`.
         """
-        x, from_tasks, self._follows_tasks = self._layout, v_desired is None, v_desired is None
+        x, from_tasks, self.follows_tasks = self._layout, v_desired is None, v_desired is None
         self.q[:] = q  # the code takes q as it is: in one piece, and writeable
         if v_desired is not None:
             x.v_tracking[:] = v_desired
         if self.dynamics is not None:
             self.dynamics.update(self.q, x.v_prev)
-        if self._is_compiled:
-            moving = self.query.is_moving
-            code = self._step(self._packed, self.q, self.influence_distance, moving, from_tasks, False)
-            if code != TO_MEASURE:
-                return code == SETTLED
-            self.query.finish()
-            return self._finish()
+        if self.is_compiled:
+            return self.run()
         self._measure()
         if from_tasks and self.task_errors.size:
             self._task_rows.write(q, self._forward, targets[len(self.targets) :])
@@ -189,12 +185,21 @@ class RowAssembler(TrackedVelocities):
                 x.v_prev[:] = resting.project(x.v_prev)
         return self._finish()
 
+    def run(self) -> bool:
+        """Compute a step at `q` in one call, but for pairs whose cores meet; return what `compute` does."""
+        moving, from_tasks = self.query.is_moving, self.follows_tasks
+        code = self._step(self._packed, self.q, self.influence_distance, moving, from_tasks, False)
+        if code != TO_MEASURE:
+            return code == SETTLED
+        self.query.finish()
+        return self._finish()
+
     def follow(self, v_desired: Array, at_once: bool = False) -> bool:
         """Follow a velocity (nv,) in place of the tasks in the last step after all; return what `compute` does.
 
         With `at_once`, a torque level takes it as that of the end of the control period, and does not approach it.
         """
-        self._follows_tasks, self._layout.v_tracking[:] = False, v_desired
+        self.follows_tasks, self._layout.v_tracking[:] = False, v_desired
         if self.dynamics is None or not at_once:
             return self._finish()
         self.dynamics.approaches[0] = False
@@ -203,7 +208,7 @@ class RowAssembler(TrackedVelocities):
 
     def _finish(self) -> bool:
         """Compute a step whose kinematics and distances are up to date."""
-        arguments = self.query.is_moving, self._follows_tasks, True
+        arguments = self.query.is_moving, self.follows_tasks, True
         code = self._step(self._packed, self.q, self.influence_distance, *arguments)
         if self._contact_rows is not None:
             self._hold(self._contact_rows)
@@ -230,7 +235,7 @@ class RowAssembler(TrackedVelocities):
     def problem(self) -> Problem:
         """Return the problem of the last step."""
         x, (_, violation, is_clear, position_margin, bent) = self._layout, self._layout.summary.item()
-        tracking, levels = (self._tracking, self._levels) if self._follows_tasks else (self._following, ())
+        tracking, levels = (self._tracking, self._levels) if self.follows_tasks else (self._following, ())
         return Problem(
             tracking, self._view()[1], x.lower, x.upper, *self._hard, x.v_stop, self._scene.pair_names,
             self.joint_names, self.joint_units, x.v_tracking, violation, self._contact_rows, levels, None, bent,
@@ -241,7 +246,7 @@ class RowAssembler(TrackedVelocities):
     def _hold(self, contacts: Contacts) -> None:
         """Let the velocity that is tracked hold the contacts."""
         x, summary = self._layout, self._layout.summary[0]
-        if self._follows_tasks:
+        if self.follows_tasks:
             summary.bent = self._track_within(contacts)
         else:
             x.v_tracking[:] = contacts.project(x.v_tracking)

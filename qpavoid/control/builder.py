@@ -4,17 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from math import hypot
 from threading import get_ident
 from typing import Any
 
 import numpy as np
 import pinocchio as pin
 
+from qpavoid import kernels
 from qpavoid.control.arguments import ArgumentReader, Arguments
 from qpavoid.control.assembler import RowAssembler
 from qpavoid.control.attach import Attachments
 from qpavoid.control.contacts import ContactRows
-from qpavoid.control.inputs import Clock, Configurations
+from qpavoid.control.inputs import LARGEST_VELOCITY, Clock, Configurations
 from qpavoid.control.latency import CommandsUnderWay
 from qpavoid.control.obstacles import ObstacleTracker
 from qpavoid.control.settings import ControlSettings
@@ -26,6 +28,8 @@ from qpavoid.kernels.bounds import OUTSIDE
 from qpavoid.model.sample import POSE, Sample
 from qpavoid.problem import Array
 from qpavoid.reason import Reason
+
+_FLOAT = np.dtype(np.float64)
 
 
 @dataclass(slots=True)
@@ -45,6 +49,8 @@ class StepProblem:
     faults: tuple[Reason, ...]
     """Why the robot has to stop."""
     assumptions: tuple[Reason, ...]
+    is_plain: bool = False
+    """Whether it is settled, and nothing stops the robot, nor is there any dynamics or latency to see to."""
 
 
 class ProblemBuilder:
@@ -66,9 +72,13 @@ class ProblemBuilder:
         units = [names[j] for j in bounds.v_index.tolist()]
         self._configurations = Configurations(model, bounds.q_index, bounds.lower, bounds.upper, units)
         self._targets = TargetReader(tasks, self.rows.targets, settings.latency)
-        shapes = (model.nq,), (model.nv,)
+        shapes = self._q_shape, self._v_shape = (model.nq,), (model.nv,)
         reader = ArgumentReader(shapes, self._clock, self._configurations, self._targets, self.tracker)
         self._read = reader.read
+        limits, strided = self._configurations.bounds, np.zeros(2 * model.nq)[::2]
+        self._usual_arguments = limits, np.zeros(int(limits[2].max()) + 1), self.rows.targets, self.rows.q
+        self._take_usual = kernels.direct(kernels.take_usual, strided, *self._usual_arguments)  # q: of any strides
+        self._has_plain_steps = self.rows.is_compiled and self.rows.dynamics is None and not settings.latency
         self._thread: int | None = None
         self.begun: StepProblem | None = None
         """Step whose command is not known yet."""
@@ -119,7 +129,48 @@ class ProblemBuilder:
             assumptions += self._bounds.outside(q, rows.joint_names, rows.joint_units)
         step = self.begun = self._step
         step.q, step.t, step.resumed, step.targets = rows.q, times.t + self._latency, times.resumed, targets
-        step.is_settled, step.faults, step.assumptions = is_settled, faults, assumptions
+        step.is_settled, step.faults, step.assumptions, step.is_plain = is_settled, faults, assumptions, False
+        return step
+
+    def begin(self, q: Any, t: Any, targets: Any, obstacles: Any, v: Any) -> StepProblem:
+        """Build the problem of a step of the tasks from its arguments, see `Controller.step`: whatever raises does so.
+
+        Raises:
+            NumericalError, UnknownName: as `Controller.step`.
+        """
+        step = self._build_plain(q, t, targets, obstacles, v)
+        return self.build(self.read(q, t, targets, obstacles, v)) if step is None else step
+
+    def _build_plain(self, q: Any, t: Any, targets: Any, obstacles: Any, v: Any) -> StepProblem | None:
+        """Do as `read` and `build` where one compiled call is all of a step, and arguments are plain and as expected.
+
+        Returns:
+            None where it is another step, for which nothing has been changed.
+        """
+        if not (self._has_plain_steps and self.begun is None and self._thread is None and _is_plain(q, self._q_shape)):
+            return None
+        if v is not None and not (_is_plain(v, self._v_shape) and hypot(*v.tolist()) <= LARGEST_VELOCITY):
+            return None
+        if (now := self._clock.usual(t)) is None or (samples := self._targets.usual(now, targets)) is None:
+            return None
+        if self._budget.is_limited:
+            self._budget.begin()
+        update = self.tracker.read(now, obstacles)
+        if not self._take_usual(q, *self._usual_arguments):
+            return None
+        self._thread, self._targets.last, step, rows = get_ident(), samples, self._step, self.rows
+        self._clock.set(now)
+        step.q, step.t, step.resumed, step.targets, step.faults, step.assumptions = rows.q, now, False, samples, (), ()
+        if update is not None:
+            step.assumptions, step.faults = self.tracker.advance(update)
+            rows.query.place(self.tracker.current)
+        rows.follows_tasks = True
+        step.is_settled = rows.run()
+        if self.attachments.is_watching:
+            self.attachments.update()
+        if not step.is_settled and rows.position_margin < -OUTSIDE:
+            step.assumptions += self._bounds.outside(rows.q, rows.joint_names, rows.joint_units)
+        step.is_plain, self.begun = step.is_settled and not step.faults, step
         return step
 
     def _predict(self, q: Array | None) -> Array:
@@ -196,3 +247,8 @@ class ProblemBuilder:
         self._clock.reset()
         self._targets.last = ()
         self.tracker.reset()
+
+
+def _is_plain(value: Any, shape: tuple[int, ...]) -> bool:
+    """Return whether a value is an array of that shape that needs no conversion."""
+    return type(value) is np.ndarray and (value.dtype is _FLOAT or value.dtype == _FLOAT) and value.shape == shape

@@ -13,14 +13,21 @@ from typing import Any
 import numpy as np
 
 from qpavoid.errors import NumericalError
-from qpavoid.kernels.obstacles import EXACT, FAR, FAST, LEFT_HANDED, NEARLY, NO_QUATERNION, NO_ROTATION, NOT_FINITE
+from qpavoid.kernels.obstacles import (
+    EXACT,
+    FAR,
+    FARTHEST,
+    FAST,
+    FASTEST,
+    LEFT_HANDED,
+    NEARLY,
+    NO_QUATERNION,
+    NO_ROTATION,
+    NOT_FINITE,
+)
 from qpavoid.problem import Array, as_vector, not_finite
 from qpavoid.reason import Reason, ReasonKind, Severity
 
-FARTHEST = 1e6
-"""Coordinate of a position that is farther than any in a scene [m]; round-off is 0.1 nm there."""
-FASTEST = 1e3
-"""Component of a twist that nothing in a scene has [m/s, rad/s]."""
 LARGEST_VELOCITY = 1e4
 """Norm of a measured joint velocity that no robot has, whatever its number of joints [rad/s, m/s]."""
 LARGEST_COMMAND = 1e6
@@ -67,9 +74,16 @@ class Clock:
 
     def __init__(self, dt: float) -> None:
         self._dt, self._now = dt, -inf
-        self._regular = Times(0.0)
         self._gap = max(_GAP[0] * dt, _GAP[1])
         self._fine = 2.0 ** (52 + floor(log2(_RESOLUTION * dt)))  # below it, the resolution of a time is fine enough
+
+    def usual(self, t: Any) -> float | None:
+        """Return the time of the next step where that goes on as it should [s], None where there is more to see to."""
+        expected = self._now + self._dt
+        if t is None:
+            return expected if expected > -inf else None
+        is_usual = type(t) is float and abs(t - expected) <= _OFF * self._dt and abs(t) < self._fine
+        return t if is_usual else None
 
     @property
     def is_first(self) -> bool:
@@ -85,7 +99,7 @@ class Clock:
         self._now = t
 
     def read(self, t: Any) -> Times:
-        """Return the time of the next step, until the next call; nothing is changed.
+        """Return the time of the next step; nothing is changed.
 
         Args:
             t: as given [s]; None for a control period after the last step.
@@ -94,10 +108,8 @@ class Clock:
             NumericalError: t is no number.
         """
         expected = self._now + self._dt if self._now > -inf else 0.0
-        is_on_time = self._now == -inf or t is None or (type(t) is float and abs(t - expected) <= _OFF * self._dt)
-        if t is None or (is_on_time and type(t) is float and abs(t) < self._fine):
-            self._regular.t = expected if t is None else t  # one object for all: to make one takes longer
-            return self._regular
+        if t is None or self.usual(t) is not None:
+            return Times(expected if t is None else t)
         t = as_time("t", t)
         if not ulp(t) <= _RESOLUTION * self._dt:  # neither for NaN and infinity
             rough = f"{t:g}: its resolution is coarser than {_RESOLUTION:g} control periods; is it in seconds?"
@@ -148,6 +160,12 @@ class Configurations:
         self._owners = [model.names[i] for i, joint in enumerate(joints) for _ in range(joint.nq)]
         self._names = [next(model.names[j.id] for j in joints if j.idx_q == k and j.nq) for k in self._index.tolist()]
         self._units_of_length_1 = _unit_parts(model)
+        self.bounds = np.full((3, model.nq), FARTHEST)
+        """(3, nq) least and largest value of each coordinate, and number of the part of length 1 it is in, or -1."""
+        self.bounds[0], self.bounds[2] = -FARTHEST, -1.0
+        self.bounds[0, self._index], self.bounds[1, self._index] = self._lower, self._upper
+        for number, (part, _) in enumerate(self._units_of_length_1):
+            self.bounds[2, part] = number
         least = np.minimum(-self._lower, self._upper)
         self._small = float(np.min(least, initial=FARTHEST))
         """Norm up to which no coordinate is beyond anything."""

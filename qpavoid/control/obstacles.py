@@ -17,14 +17,14 @@ import numpy as np
 from qpavoid import kernels
 from qpavoid.config import Sensing
 from qpavoid.control.estimates import MeasuredStates
-from qpavoid.control.inputs import FARTHEST, FASTEST, FAULTS
+from qpavoid.control.inputs import FAULTS
 from qpavoid.control.obstacle_states import NOTHING, Observation, ObstacleStates, StepUpdate
 from qpavoid.control.trajectories import TrajectoryBatch, extrapolate
 from qpavoid.control.update_parts import unlikely
 from qpavoid.control.updates import NO_UPDATE, Update, UpdateReader
 from qpavoid.errors import NumericalError
 from qpavoid.kernels import Prediction
-from qpavoid.kernels.obstacles import FAST, NORMALISED, NOT_FINITE, SAMPLE
+from qpavoid.kernels.obstacles import FARTHEST, FAST, FASTEST, NORMALISED, NOT_FINITE, SAMPLE
 from qpavoid.model.sample import Sample
 from qpavoid.model.scene import Obstacle
 from qpavoid.model.trajectory import Motion
@@ -100,20 +100,27 @@ class ObstacleTracker:
         """What is known of the obstacles in the last step, as far as the future follows from it; nothing changes it."""
         if self._prediction is None:
             now, external = self.current, self.external
-            twists = self.mean_twists.copy() if len(external) else self.mean_twists
+            twists, turns = self.twists, self.turns
+            if len(external):
+                twists, turns = twists.copy(), turns.copy()
             states, margin = now.states.copy(), now.margin.copy()
             self._prediction = Prediction(
-                self._trajectories.pieces, now.which, states, margin, external, twists, self._now
+                self._trajectories.pieces, now.which, states, margin, external, twists, turns, self._now
             )
         return self._prediction
 
     @property
-    def mean_twists(self) -> Array:
-        """(o, 6) mean twists of external obstacles, with which they are predicted; zero of all others."""
+    def twists(self) -> Array:
+        """(o, 6) twists with which external obstacles are predicted; zero of all others."""
         return self._measured.arrays.twists
 
+    @property
+    def turns(self) -> Array:
+        """(o, 3) rates at which their linear velocities turn [rad/s]."""
+        return self._measured.arrays.turns
+
     def at(self, t: float, prediction: Prediction | None = None) -> ObstacleStates:
-        """Return the states at t [s]: on trajectories, or at constant mean twists; of the last step, as observed.
+        """Return the states at t [s]: on trajectories, or on lines and arcs; of the last step, as observed.
 
         Those of the last step are overwritten by the next one.
 

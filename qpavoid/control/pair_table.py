@@ -123,6 +123,11 @@ class PairTable:
         for query in self.queries:
             query.update_slot(index)
 
+    def forget_guesses(self) -> None:
+        """Let the searches of all distances that look into this table start anew."""
+        for query in self.queries:
+            query.forget_guesses()
+
     def rigid_pairs(self) -> Mask:
         """Return the pairs (m,) of an attached object with what moves along with it or hangs below it."""
         (first, second), rigid = self._scene.pairs.T, np.zeros(len(self.group), dtype=bool)

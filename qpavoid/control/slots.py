@@ -15,10 +15,10 @@ import numpy as np
 from qpavoid import kernels
 from qpavoid.control.attach import Attachments
 from qpavoid.control.distances import DistanceQuery
-from qpavoid.control.inputs import FARTHEST, FASTEST, FAULTS
+from qpavoid.control.inputs import FAULTS
 from qpavoid.control.obstacles import ObstacleTracker
 from qpavoid.errors import ConfigError, NumericalError
-from qpavoid.kernels.obstacles import NORMALISED, SAMPLE
+from qpavoid.kernels.obstacles import FARTHEST, FASTEST, NORMALISED, SAMPLE
 from qpavoid.model.scene import Obstacle, Scene, check_name, is_one_solid, spare_solid, without_sphere
 from qpavoid.model.solids import make_solids
 

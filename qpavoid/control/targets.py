@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 
 from qpavoid import kernels
-from qpavoid.control.inputs import FARTHEST, FASTEST, FAULTS
+from qpavoid.control.inputs import FAULTS
 from qpavoid.control.tasks import RowTask
 from qpavoid.control.trajectories import extrapolate
 from qpavoid.errors import ConfigError, NumericalError, UnknownName, nearest
-from qpavoid.kernels.obstacles import FINE, NORMALISED, SAMPLE
+from qpavoid.kernels.obstacles import FARTHEST, FASTEST, FINE, NORMALISED, SAMPLE
 from qpavoid.model.sample import Sample, as_sample
 from qpavoid.model.trajectory import Trajectory
 from qpavoid.problem import Array
@@ -52,7 +52,6 @@ class TargetReader:
         self.read(0.0, None)
         self._takes_samples = not latency and len(tasks) == len(frames)
         """Whether there are only frames, whose samples count as they are given."""
-        self._are_fine = kernels.direct(kernels.are_fine, frames, FARTHEST, FASTEST)
 
     def read(self, t: float, targets: Mapping[str, Any] | None) -> Targets:
         """Return the targets of all tasks.
@@ -67,25 +66,35 @@ class TargetReader:
         """
         if targets is not None and type(targets) is not dict and not isinstance(targets, Mapping):
             raise NumericalError(f"targets: give a mapping of names to targets, not {targets!r:.60}")
-        if not targets:
+        if (samples := self.usual(t, targets or None)) is None or (targets and not self._are_fine()):
+            return self._read_each(t, targets or {})
+        return samples, (), ()
+
+    def usual(self, t: float, targets: Any) -> Sequence[Any] | None:
+        """Return the targets of all tasks, not checked, where none or a `Sample` of each frame is given; else None."""
+        if targets is None:
             samples = [motion.sample(t + self._latency) for motion in self._motions]
             if not (self._is_still and self._is_written):
                 self._write(samples)
                 self._is_written = True
-            return samples, (), ()
+            return samples
         self._is_written = False
-        if self._takes_samples and len(targets) == len(self._names):
-            samples = []
-            for name, row in self._named_rows:
-                sample = targets.get(name)
-                if type(sample) is not Sample:
-                    break
-                row[:] = sample.row
-                samples.append(sample)
-            else:
-                if self._are_fine(self._frames, FARTHEST, FASTEST):
-                    return samples, (), ()
-        return self._read_each(t, targets)
+        if type(targets) is not dict or not self._takes_samples or len(targets) != len(self._named_rows):
+            return None
+        samples = []
+        for name, row in self._named_rows:
+            sample = targets.get(name)
+            if type(sample) is not Sample:
+                return None
+            row[:] = sample.row
+            samples.append(sample)
+        return samples
+
+    def _are_fine(self) -> bool:
+        """Return whether the states of the frame tasks can be true, and need not be normalised."""
+        count = len(self._frames)
+        numbers, kinds = np.arange(count), np.full(count, SAMPLE)
+        return not kernels.check_states(self._frames, numbers, kinds, FARTHEST, FASTEST)[0].any()
 
     def _placed(self, task: RowTask, value: Any) -> Any:
         """Return a target as it is, or the pose that it stands for, of a task whose target is somewhere.

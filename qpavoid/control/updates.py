@@ -49,6 +49,8 @@ class _Selection(NamedTuple):
     names: Sequence[str]
     form: type | int
     """Class of the samples, or number of columns of the array."""
+    shape: tuple[int, int]
+    """Of an array."""
     rows: IntArray | None
     """Rows of the array that count: an attached obstacle has none; None where all do."""
     update: Update
@@ -111,14 +113,14 @@ class UpdateReader:
             NumericalError: an entry of the wrong shape, or not made of numbers.
         """
         names = list(updates)
+        if len(names) == 1 and type(names[0]) is tuple:
+            return self.read_array(t, names[0], updates[names[0]])
         if self._selection is not None and self._selection.names == names:
             update = self._read_selected(t, shift, self._selection, list(updates.values()))
             if update is not None:
                 return update
         if any(type(name) is tuple for name in names):
-            if len(names) > 1:
-                raise NumericalError("obstacles: an array among others; give all in one array, or one by one")
-            return self.read_array(t, names[0], updates[names[0]])
+            raise NumericalError("obstacles: an array among others; give all in one array, or one by one")
         numbers = [self.index(name) for name in names]
         placed = {name: self._placed(name, value, t) for name, value in updates.items()}
         forms = set(map(type, placed.values()))
@@ -153,7 +155,11 @@ class UpdateReader:
             UnknownName: there is no such obstacle.
             NumericalError: the array has the wrong shape, or is not made of numbers; an obstacle is named twice.
         """
+        selection = self._selection
         is_plain = type(value) is np.ndarray and value.dtype == np.float64 and value.flags.c_contiguous
+        if is_plain and selection is not None and selection.names is names and selection.shape == value.shape:
+            selection.update.stamps.fill(t)
+            return self._check(value if selection.rows is None else value[selection.rows], selection.update)
         try:
             rows = value if is_plain else np.ascontiguousarray(as_numbers("obstacles", value))
         except NumericalError:
@@ -164,7 +170,7 @@ class UpdateReader:
                 f"obstacles: an array of shape {rows.shape}; give a row of {STATE} numbers, as `Sample.row`, or of "
                 f"{QUATERNION}, position and quaternion x y z w, for each of these {len(names)}: {', '.join(names):.60}"
             )
-        selection, columns = self._selection, rows.shape[1]
+        columns = rows.shape[1]
         if selection is None or selection.form != columns or selection.names != names:
             numbers = [self.index(name) for name in names]
             if len(set(numbers)) < len(numbers):
@@ -199,7 +205,8 @@ class UpdateReader:
             which, np.full(len(rows), POSE if is_bare else SAMPLE), np.zeros(len(rows)), {}, (), tuple(notes),
             self._twists_estimated(which) if is_bare else (),
         )  # fmt: skip
-        return _Selection(names, form, np.array(rows, dtype=np.intp) if notes else None, update)
+        shape = len(names), form if isinstance(form, int) else 0
+        return _Selection(names, form, shape, np.array(rows, dtype=np.intp) if notes else None, update)
 
     def _twists_estimated(self, which: IntArray) -> tuple[Reason, ...]:
         """Return the reasons why twists are estimated, of bare poses of some obstacles (k,)."""

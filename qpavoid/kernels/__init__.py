@@ -1,6 +1,7 @@
 """Array work of a control step: loops that numba compiles at their first use, and stores on disk (`kernels.cache`)."""
 
 from qpavoid.kernels.approach import ApproachArrays, comes_near, extend_paths, write_path_point
+from qpavoid.kernels.arguments import take_usual
 from qpavoid.kernels.backup import (
     backup_rows,
     closes_below,
@@ -34,7 +35,7 @@ from qpavoid.kernels.dynamics import (
     project_widened,
 )
 from qpavoid.kernels.dynamics_rows import slow_rows
-from qpavoid.kernels.estimates import ObstacleArrays, are_fine, check_updates, observe
+from qpavoid.kernels.estimates import ObstacleArrays, check_updates, observe
 from qpavoid.kernels.kinematics import KinematicsArrays, update_kinematics
 from qpavoid.kernels.layout import SUMMARY, RowLayout
 from qpavoid.kernels.margins import distances_of, least_margin
@@ -89,7 +90,6 @@ __all__ = [
     "add_curvature",
     "advance_rollout",
     "alpha",
-    "are_fine",
     "assemble",
     "backup_rows",
     "begin_rollout",
@@ -153,6 +153,7 @@ __all__ = [
     "speed_to_stop",
     "standing_dynamics",
     "stop_velocity",
+    "take_usual",
     "tracking_law",
     "tracking_violation",
     "update_kinematics",

@@ -14,6 +14,10 @@ from qpavoid.problem import Array, IntArray
 
 FINE, NORMALISED, NOT_FINITE, FAR, FAST, NO_ROTATION, LEFT_HANDED, NO_QUATERNION = range(8)
 """Codes of `check_states`; the last one of `check_updates` alone: a quaternion that is not of length 1."""
+FARTHEST = 1e6
+"""Coordinate of a position that is farther than any in a scene [m]; round-off is 0.1 nm there."""
+FASTEST = 1e3
+"""Component of a twist that nothing in a scene has [m/s, rad/s]."""
 EXACT, NEARLY = 1e-6, 1e-3
 """|RᵀR - I| up to which a matrix is taken for a rotation as it is (rotations in single precision are 1e-7 off), and up
 to which it is replaced by the nearest rotation (the rounding of a matrix that was typed with three digits) [-]."""

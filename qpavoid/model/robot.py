@@ -37,7 +37,7 @@ from qpavoid.model.xml_file import read_robot_xml
 from qpavoid.problem import Array
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Robot:
     """Model, bodies, pairs, limits and home pose of a robot; immutable."""
 

@@ -9,7 +9,6 @@ from xml.sax import SAXParseException
 from xml.sax.handler import ContentHandler
 from xml.sax.xmlreader import AttributesImpl, InputSource
 
-import defusedxml.sax
 from defusedxml import DefusedXmlException
 
 from qpavoid.config.files import read_text
@@ -58,6 +57,8 @@ def undeclared_prefixes(root: ET.Element) -> list[str]:
 
 def _parse(text: str) -> ET.Element:
     """Parse a text; prefixes are part of the names, as the C++ parsers have it."""
+    import defusedxml.sax  # brings in what reads from the net
+
     parser, builder, source = defusedxml.sax.make_parser(), _Builder(), InputSource()
     parser.forbid_dtd = True
     parser.setContentHandler(builder)

@@ -212,6 +212,7 @@ class Forecaster(SceneChanges):
         """Bring the controller into a state."""
         self._builder.reset(start.v)
         self._builder.rows.previous.dv[:] = start.dv
+        self._builder.rows.query.table.forget_guesses()  # so that nothing depends on earlier forecasts
         self._arbiter.reset()
         self._driver.begin(start.drive)
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import platform
 from collections.abc import Iterable
+from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -28,13 +29,17 @@ def machine() -> dict[str, Any]:
 
 def versions(packages: Iterable[str] = PACKAGES) -> dict[str, str]:
     """Return the version of each package that is installed."""
-    result = {}
-    for package in packages:
-        try:
-            result[package] = version(package)
-        except PackageNotFoundError:
-            continue
-    return result
+    installed = {package: _version(package) for package in packages}
+    return {package: number for package, number in installed.items() if number}
+
+
+@cache
+def _version(package: str) -> str:
+    """Return the version of a package, nothing where it is not installed: each takes some ms to read."""
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return ""
 
 
 def cpu() -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import platform
+from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -16,6 +17,7 @@ from qpavoid.control.tick import Tick
 from qpavoid.controller import Controller
 from qpavoid.geometry.bodies import enclosing_capsule, surface_triangles
 from qpavoid.model.kinematics import ForwardKinematics
+from qpavoid.model.robot import Robot
 from qpavoid.model.sample import STATE
 from qpavoid.model.scene import PARKING_DISTANCE, Obstacle, Scene
 from qpavoid.problem import Array, Solution, Status
@@ -42,7 +44,7 @@ class Recorder:
         self._frames, self._other_tasks = in_order(controller.tasks)
         self._controller, self._plant = controller, plant
         self._kinematics, self._query = ForwardKinematics(model), controller.distances()  # of all pairs, near or not
-        self._ends, self._radii = _drawing_axes(scene.robot.bodies)
+        self._ends, self._radii = _drawing_axes(scene.robot)
         sizes = {"N": ticks, "nq": model.nq, "nv": model.nv, "k": len(self._frames), "s": len(self._other_tasks)}
         sizes |= {"m": len(plant.torque) if plant else 0, "c": len(plant.point_names) if plant else 0}
         self._arrays = Log.allocate({**sizes, "b": len(scene.body_names), "o": 0})
@@ -230,13 +232,15 @@ def describe_obstacle(scene: Scene, index: int) -> dict[str, Any]:
     return described
 
 
-def _drawing_axes(bodies: Any) -> tuple[Array, list[float]]:
+@lru_cache(maxsize=4)
+def _drawing_axes(robot: Robot) -> tuple[Array, list[float]]:
     """Return axis ends (b, 2, 3) in the parent joint's frame and radius of each body.
 
     A body that is no capsule is drawn as the capsule around it.
     """
-    ends, radii = np.empty((len(bodies.geometryObjects), 2, 3)), []
-    for i, body in enumerate(bodies.geometryObjects):
+    bodies = robot.bodies.geometryObjects
+    ends, radii = np.empty((len(bodies), 2, 3)), []
+    for i, body in enumerate(bodies):
         fit = enclosing_capsule(body.geometry)
         half = 0.5 * fit.length * fit.rotation[:, 2]
         local = np.array([fit.center - half, fit.center + half])

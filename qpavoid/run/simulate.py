@@ -83,7 +83,7 @@ def run(scenario: ScenarioConfig, robot: Robot | None, progress: Callable[[int, 
             if motors is not None:
                 recorder.add(_play(controller, motors, k * dt))
             else:
-                tick = controller.tick(follower.q, k * dt, v=follower.v)
+                tick = controller.tick(follower.q, k * dt, v=follower.v, copy=False)
                 recorder.add(tick)
                 follower.follow(tick.solution.v)
             if progress is not None:
@@ -113,7 +113,7 @@ def make_plant(robot: Robot, q: Array, settings: PlantSettings, contacts: Sequen
 def _play(controller: Controller, plant: TorquePlant, t: float) -> Tick:
     """Take a step at t [s] by what the plant measures, and return it with the state that was true."""
     state, (q, v) = State(plant.q, plant.v, t), plant.measure()
-    tick = controller.tick(q, t, v=v)
+    tick = controller.tick(q, t, v=v, copy=False)
     plant.follow(tick.solution, controller.dt)
     return tick._replace(state=state)
 

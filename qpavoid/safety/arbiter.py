@@ -61,6 +61,13 @@ class Arbiter:
         """Return the velocities (k, nv) of the control steps of the backup trajectory; none without one."""
         return np.zeros((0, *self._v_shape)) if self.backup is None else self.backup.velocities
 
+    def accepts(self, t: float) -> bool:
+        """Count a settled step of the tasks at t [s] if it is commanded as it is, else change nothing; see `decide`."""
+        damping, backup = self._shake_damping, self.backup
+        if self._reports_limits or damping.factor != 1.0 or not damping.is_idle:
+            return False
+        return (backup is None or backup.rests(self._rows.v, t)) and self.progress.skip()
+
     def decide(self, q: Array, t: float, is_settled: bool, from_tasks: bool) -> Solution:
         """Return the solution that is commanded.
 

@@ -128,6 +128,12 @@ class BackupPlanner:
         """Whether there is a backup trajectory or a candidate: while nothing moves, `check` would only drop it."""
         return self._backup is not None or self._kind >= 0
 
+    def rests(self, v: Array, t: float) -> bool:
+        """Return whether nothing that moves is near a robot at v (nv,) at t [s], nor was: `check` changes nothing."""
+        if self.is_active or self._moving is not self._obstacles.moving:
+            return False
+        return not len(self._moving) or self._approach.is_far(v, t)
+
     def check(
         self, q: Array, v: Array, t: float, v_prev: Array, dv_prev: Array, proximity: Callable[[], Proximity]
     ) -> Array | None:

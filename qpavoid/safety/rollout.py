@@ -1,6 +1,6 @@
 """Rollouts of backup trajectories: the robot drops its tasks and keeps away from everything.
 
-Obstacles follow their trajectories, or are predicted at constant velocity. In every period a backup trajectory
+Obstacles follow their trajectories, or are predicted on lines and arcs. In every period a backup trajectory
 maximises the smallest distance at a horizon h, to first order:
 
     max s - ½ s²/c - ε/2c ‖v - v̂‖²  s.t.  d + h (J v + ḋ_obs) >= s,  s <= c,  lower <= v <= upper

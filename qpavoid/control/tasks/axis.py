@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 
 from qpavoid import config
-from qpavoid.control.inputs import FARTHEST
 from qpavoid.control.tasks.base import Constant, RowTask, Target, frame_pose, length
 from qpavoid.control.tasks.start import Start
 from qpavoid.errors import ConfigError
+from qpavoid.kernels.obstacles import FARTHEST
 from qpavoid.model.kinematics import ForwardKinematics
 from qpavoid.model.sample import as_goal
 from qpavoid.problem import Array, as_vector
