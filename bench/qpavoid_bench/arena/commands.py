@@ -25,6 +25,7 @@ from qpavoid_bench.serve import serve
 from qpavoid_bench.solvers.command import solvers
 from qpavoid_bench.survey import robots
 from qpavoid_bench.tick.command import tick
+from qpavoid_bench.torque_steps import dynamics
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -49,7 +50,8 @@ app.command()(serve)
 app.command()(camera)
 app.command()(adapters)
 app.command()(grasps)
-_MEASURES = ("tick", "solvers", "endurance", "robots", "grasps", "serve", "camera", "adapters")
+app.command()(dynamics)
+_MEASURES = ("tick", "solvers", "endurance", "robots", "grasps", "serve", "camera", "adapters", "dynamics")
 """Commands that need none of the packages below."""
 
 _PACKAGES = ("distributed", "mujoco", "pandas", "statsmodels", "matplotlib")

@@ -83,7 +83,8 @@ class Score:
     jitter: float
     """Σ|Δq̇| over joints and ticks, per second [rad/s² or m/s²]."""
     frozen: float
-    """Fraction of the time with all tools at rest and a target away that is in reach, whatever is in the way [-]."""
+    """Fraction of the time with all tools at rest and a target away that is in reach, whatever is in the way; 0 of a
+    robot whose base floats, of whose reach nothing is known [-]."""
     lurch: float
     """Largest Σ|Δq̇| of a step over joints, from rest [rad/s or m/s]."""
     chatter: float
@@ -212,7 +213,8 @@ def _frozen_fraction(case: Case, world: World, rollout: Rollout) -> float:
     speed = np.linalg.norm(np.diff(rollout.tool, axis=0), axis=2).max(axis=1, initial=0.0) / dt
     away = np.linalg.norm(rollout.target - rollout.tool, axis=2) > case.scenario.goal_tolerance
     at_rest = np.append(speed < REST_SPEED, False)
-    if not (at_rest[:, None] & away).any():
+    is_floating = world.contacts is not None
+    if is_floating or not (at_rest[:, None] & away).any():
         return 0.0
     every, robot = max(1, round(_REACH_PERIOD / dt)), world.scene.robot
     points = np.round(rollout.target[::every], 3)
