@@ -29,13 +29,13 @@ def main() -> None:
     problem = tsid.InverseDynamicsFormulationAccForce("tsid", robot, False)
     problem.computeProblemData(0.0, q[0], v[0])
     data, n = problem.data(), model.nv
-    kept = []  # it keeps no references: what Python frees crashes it
+    owned = []  # it keeps no references: what Python frees crashes it
     corners, gains = np.array(settings["corners"]).T, (settings["stiffness"], settings["damping"])
 
     def tuned(task, size):
         task.setKp(gains[0] * np.ones(size))
         task.setKd(gains[1] * np.ones(size))
-        kept.append(task)
+        owned.append(task)
         return task
 
     for frame in settings["feet"]:
@@ -50,7 +50,7 @@ def main() -> None:
         reference = tsid.TrajectorySE3Constant(f"{frame} at rest", place).computeNext()
         task.setReference(reference)
         problem.addMotionTask(task, 1.0, 1, 0.0)
-        kept.append(reference)
+        owned.append(reference)
     com = tuned(tsid.TaskComEquality("com", robot), 3)
     com.setReference(tsid.TrajectoryEuclidianConstant("com at rest", robot.com(data)).computeNext())
     problem.addMotionTask(com, 1.0, 1, 0.0)
@@ -59,7 +59,7 @@ def main() -> None:
     problem.addMotionTask(posture, 0.01, 1, 0.0)
     bounds = tsid.TaskActuationBounds("torques", robot)
     bounds.setBounds(-given["torque"], given["torque"])
-    kept.append(bounds)
+    owned.append(bounds)
     problem.addActuationTask(bounds, 1.0, 0, 0.0)
     solver = tsid.SolverHQuadProgFast("qp")
     solver.resize(problem.nVar, problem.nEq, problem.nIn)
