@@ -232,8 +232,7 @@ class Controller(SceneChanges, SplitStep):
         if step.is_plain and self._planning is None and self._arbiter.accepts(step.t):
             middle, v = perf_counter(), builder.rows.v.copy()
             builder.remember(v)
-            solution = Solution.solved(v, middle - begin, perf_counter() - middle)
-            return solution._replace(assumptions=step.assumptions) if step.assumptions else solution
+            return Solution.solved(v, step.assumptions, middle - begin, perf_counter() - middle)
         return self._decide(step, begin)
 
     def tick(

@@ -189,7 +189,7 @@ def test_an_attached_object_is_moved_out_of_the_way_too(tmp_path):
 # --- bounded work --------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("dt", "poses"), [(0.01, 100), (0.002, 15)])
+@pytest.mark.parametrize(("dt", "poses"), [(0.01, 114), (0.002, 17)])
 def test_work_of_a_step_is_bounded(tmp_path, evaluations, dt, poses):
     """So many poses, whatever is searched for; a trajectory takes 41 to 82."""
     controller, most = controller_of(tmp_path, press(), speed=0.4, dt=dt), 0
@@ -208,7 +208,7 @@ def test_an_obstacle_that_appears_near_is_evaded_within_the_same_bound(tmp_path,
         center = np.array([1.0 - dt * (k - 100), 0.01, 0.0])
         updates = {"ball": Sample.at(center, linear=[-1.0, 0.0, 0.0])} if k >= 100 else None
         solution = controller.step(q, dt * k, TARGET, updates)
-        assert len(evaluations) <= 15
+        assert len(evaluations) <= 17
         assert k > 100 or solution.status is Status.SOLVED  # until a backup trajectory is known, the task goes on
         evaluations.clear()
         q = q + dt * solution.v

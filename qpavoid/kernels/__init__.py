@@ -61,6 +61,7 @@ from qpavoid.kernels.step import (
     tracking_violation,
     violation,
 )
+from qpavoid.kernels.straying import any_displaced, any_moves, strays, surprise
 from qpavoid.kernels.structures import direct, pack
 from qpavoid.kernels.task_curvature import add_curvature
 from qpavoid.kernels.tasks import frame_rows, projection_cost
@@ -90,6 +91,8 @@ __all__ = [
     "add_curvature",
     "advance_rollout",
     "alpha",
+    "any_displaced",
+    "any_moves",
     "assemble",
     "backup_rows",
     "begin_rollout",
@@ -153,6 +156,8 @@ __all__ = [
     "speed_to_stop",
     "standing_dynamics",
     "stop_velocity",
+    "strays",
+    "surprise",
     "take_usual",
     "tracking_law",
     "tracking_violation",

@@ -23,10 +23,12 @@ from qpavoid.viz.style import (
     COLLISION,
     COLOURS,
     DASHES,
+    PLAN,
     add_grid,
     add_legend,
     draw_levels,
     label_distances,
+    spans,
     units,
 )
 from qpavoid.viz.torque_figures import panels_figure, torque_figures
@@ -215,15 +217,18 @@ def speeds_figure(log: Log) -> Figure:
 
 
 def _shade_status(ax: Any, log: Log) -> list[Any]:
-    """Shade steps that were relaxed or stopped; return their legend entries."""
+    """Shade steps that were relaxed or stopped, and mark those of a plan; return their legend entries."""
     handles = []
     dt = log.meta["config"]["dt"]
     for status, colour in _STATUS_COLOUR.items():
-        bad = np.r_[False, log.status == STATUSES.index(status), False].astype(np.int8)
-        starts, ends = np.flatnonzero(np.diff(bad) == 1), np.flatnonzero(np.diff(bad) == -1)
-        for start, end in zip(starts, ends, strict=True):
-            ax.axvspan(log.t[start], log.t[end - 1] + dt, color=colour, alpha=0.35, linewidth=0, zorder=0)
-        if len(starts):
+        bad = log.status == STATUSES.index(status)
+        for start, end in spans(bad):
+            ax.axvspan(log.t[start], log.t[end] + dt, color=colour, alpha=0.35, linewidth=0, zorder=0)
+        if bad.any():
             count = int(bad.sum())
             handles.append(Patch(color=colour, alpha=0.35, label=f"{status.value}: {count} step{'s' * (count > 1)}"))
+    for start, end in spans(log.planned):
+        ax.axvspan(log.t[start], log.t[end] + dt, color=PLAN, alpha=0.15, linewidth=0, zorder=0)
+    if log.planned.any():
+        handles.append(Patch(color=PLAN, alpha=0.15, label=f"plan followed: {dt * log.planned.sum():.1f} s"))
     return handles

@@ -7,8 +7,8 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from qpavoid import build_contacts
 from qpavoid.config import ScenarioConfig
-from qpavoid.control.contacts import ContactRows, build_contacts
 from qpavoid.control.tasks import FrameTask, RowTask, build_tasks
 from qpavoid.errors import ConfigError, located
 from qpavoid.model.robot import Robot
@@ -23,8 +23,8 @@ class World(NamedTuple):
     tasks: tuple[RowTask, ...]
     q0: Array
     """(nq,) configuration at the start."""
-    contacts: ContactRows | None = None
-    """Frames that rest, of a robot that stands."""
+    contacts: Any = None
+    """Frames that rest, of a robot that stands, see `qpavoid.build_contacts`; None of others."""
 
     @property
     def tools(self) -> list[FrameTask]:
