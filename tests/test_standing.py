@@ -240,6 +240,13 @@ def test_a_contact_that_leaves_bears_less_until_it_is_free(g1, controller):
     assert controller.step(g1.home, 24 * DT, v=np.zeros(35)).forces[FEET[0]][:, 2].max() > 20.0
 
 
+def test_a_law_that_holds_no_contacts_stands_too(g1):
+    """Eq. 10 on motions that move no contact: torques within their limits, feet at rest, forces that carry it."""
+    controller = make_controller(g1, "eq10")
+    run = play(g1, controller, 0.05)
+    assert not run.has_fallen and run.slip < 1e-3 and set(run.statuses) == {"SOLVED"}
+
+
 @pytest.mark.slow
 def test_a_ball_crosses_the_waving_hand(g1, controller):
     controller.reset()

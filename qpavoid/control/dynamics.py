@@ -30,7 +30,12 @@ _EXCESS = 1e-9
 _IDENTITY = 1e-9
 """Residual of M a + h - rnea, over the size of the latter, that is round-off [-]."""
 
-
+_INSTEAD = {
+    "latency": "leave it out; of motors that are T late, more than 2 ms, give `tracking_rate` and `row_rate` at most "
+    "1 / (5 T)",
+    "planning": "leave it out; `plan_to` gives a path whose points can be the targets of steps",
+}
+"""What to do in place of what does not go together with torques yet."""
 Reasons = tuple[Reason, ...]
 
 
@@ -244,7 +249,7 @@ def make_dynamics(
         return None, bounds
     for name, given in others.items():
         if given:
-            raise ConfigError(f"dynamics: not together with `{name}` for now; leave one of them out")
+            raise ConfigError(f"dynamics: not together with `{name}`, which knows velocities alone: {_INSTEAD[name]}")
     arguments = robot, settings, bounds, dt, avoidance.row.gain
     if contacts is None:
         dynamics = RobotDynamics(*arguments)

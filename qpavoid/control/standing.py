@@ -199,9 +199,15 @@ class StandingDynamics(RobotDynamics):
         return np.asarray(kernels.with_impulses(self._packed_z, self._stance, self._x.v_prev, self._dt, v))
 
     def solve(self, solver: Solver, problem: Problem) -> Solution:
-        """Return the solution of a law, of the problem in x = (v, s p)."""
+        """Return the solution of a law, of the problem in x = (v, s p); of one that holds no contacts, in v.
+
+        Of the latter, Jacobians are those of motions that move no contact; `command` then finds the nearest velocity
+        that torques and cones allow.
+        """
         if not self._stance.is_held or not np.isfinite(problem.v_tracking).all():
             return Solution(problem.v_stop.copy(), Status.STOPPED, (_not_held(),))
+        if not solver.holds_contacts:
+            return solver.solve(self._supported(problem))
         n, m = len(self._bias), len(self._stance.Jp)
         solution = solver.solve(self._full_problem(problem))
         if solution.v.shape == (n + m,):
@@ -216,6 +222,15 @@ class StandingDynamics(RobotDynamics):
         n = len(self._bias)
         self._z.solved[:n], self._z.solved[n : len(x)] = x[:n], x[n:] / _SCALE
         self._is_answered, self._is_settled = True, False
+
+    def _supported(self, problem: Problem) -> Problem:
+        """Return a problem for a law that holds no contacts: its Jacobians are those of motions that move none."""
+        Z = self._approached.Z
+        A, J = (rows @ Z @ Z.T for rows in (problem.tracking.A, problem.avoidance.J))
+        return problem._replace(
+            tracking=problem.tracking._replace(A=A),
+            avoidance=problem.avoidance._replace(J=np.ascontiguousarray(J)),
+        )
 
     def _full_problem(self, problem: Problem) -> Problem:
         """Return a problem in v as one in x = (v, s p)."""
