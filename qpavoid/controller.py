@@ -98,7 +98,7 @@ class Controller(SceneChanges, SplitStep):
         self.tasks: tuple[RowTask, ...] = (*frames, *others)
         """Frames with a position to follow, then with an orientation alone, then all other tasks."""
         law, self.has_contacts = as_solver(solver), contacts is not None
-        check_solver(law, self.has_contacts)
+        check_solver(law, self.has_contacts and dynamics is None)
         self.limits, self._v_shape = limits or Limits(), (scene.robot.model.nv,)
         self.avoidance, self._no_backup = within_contacts(avoidance or Avoidance(), self.has_contacts, bool(dynamics))
         torques, bounds = make_dynamics(
@@ -132,7 +132,7 @@ class Controller(SceneChanges, SplitStep):
 
     @solver.setter
     def solver(self, solver: Solver | Mapping[str, Any] | str) -> None:
-        check_solver(law := as_solver(solver), self.has_contacts)
+        check_solver(law := as_solver(solver), self.has_contacts and self._builder.rows.dynamics is None)
         self._arbiter.solver = law
         self._builder.rows.adapt(law, self.avoidance.look_ahead)
         if self._planning is not None:
