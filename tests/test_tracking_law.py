@@ -268,7 +268,7 @@ def test_arm_with_a_light_posture_rests_beyond_reach(request, arm, weight, dt):
     """The posture moves what the tool leaves free, where a stretched arm bends: it may not shake the tool back in."""
     robot, (tool, _, _) = request.getfixturevalue(arm), ARMS[arm]
     (pose,) = frames(robot, [tool], robot.home)
-    target = Sample.at(pose.translation + [1.0, -1.5, 0.3], pose.rotation)
+    target = Sample.at(pose.translation + np.array([1.0, -1.5, 0.3]), pose.rotation)
     tasks = build_tasks([Task(frame=tool), PostureTask(weight=weight)], robot, robot.home)
     controller = Controller(build_scene(robot), tasks, dt=dt)
     v, _ = follow(controller, robot.home, {tool: target}, 8.0)
