@@ -12,7 +12,13 @@ from qpavoid_bench.arena.rollout import roll_out
 from qpavoid_bench.arena.trial import run_trial
 from qpavoid_bench.arena.world import build_world
 
-LATE = (("random_walk", (0, 7, 8, 9, 11)), ("noisy_sensor", (7, 8)), ("chasing", (2,)), ("head_on", (6,)))
+LATE = (
+    ("situation2", (4,)),
+    ("random_walk", (0, 7, 8, 9, 11)),
+    ("noisy_sensor", (7, 8)),
+    ("chasing", (2,)),
+    ("head_on", (6,)),
+)
 """Cases of the suite `full` with obstacles that move in which `qp` does not arrive."""
 
 

@@ -6,7 +6,6 @@ from collections import deque
 from collections.abc import Sequence
 from typing import Any
 
-import mujoco
 import numpy as np
 import pinocchio as pin
 
@@ -14,7 +13,7 @@ from qpavoid.config.plant import Payload, PlantSettings
 from qpavoid.errors import ConfigError
 from qpavoid.model.robot import Robot
 from qpavoid.problem import Array, Solution, require_finite
-from qpavoid.run.mujoco import add_joint, body_inertia, quaternion
+from qpavoid.run.mujoco import FLOATING, add_joint, body_inertia, mujoco, quaternion
 
 STEP = 1e-3
 """Largest time step of the dynamics [s]."""
@@ -91,7 +90,7 @@ class TorquePlant:
                 name=model.names[i], pos=placement.translation, quat=quaternion(placement.rotation),
                 explicitinertial=True, **body_inertia(inertias[i]),
             )  # fmt: skip
-            if joint.shortname() == "JointModelFreeFlyer":
+            if joint.shortname() == FLOATING:
                 body.add_freejoint(name=model.names[i])
             else:
                 armature = model.armature[joint.idx_v] if settings.armature is None else settings.armature

@@ -26,6 +26,7 @@ from qpavoid_bench.serve import serve
 from qpavoid_bench.solvers.command import solvers
 from qpavoid_bench.survey import robots
 from qpavoid_bench.tick.command import tick
+from qpavoid_bench.torque_steps import dynamics
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -50,8 +51,11 @@ app.command()(serve)
 app.command()(camera)
 app.command()(adapters)
 app.command()(grasps)
+app.command()(dynamics)
 app.command()(planning)
-_MEASURES = ("tick", "solvers", "endurance", "robots", "grasps", "serve", "camera", "adapters", "planning")
+_MEASURES = (
+    "tick", "solvers", "endurance", "robots", "grasps", "serve", "camera", "adapters", "dynamics", "planning",
+)  # fmt: skip
 """Commands that need none of the packages below."""
 
 _PACKAGES = ("distributed", "mujoco", "pandas", "statsmodels", "matplotlib")
