@@ -98,7 +98,7 @@ class Controller(SceneChanges, SplitStep):
         self.tasks: tuple[RowTask, ...] = (*frames, *others)
         """Frames with a position to follow, then with an orientation alone, then all other tasks."""
         law, self.has_contacts = make_solver(solver) if isinstance(solver, str) else solver, contacts is not None
-        check_solver(law, self.has_contacts)
+        check_solver(law, self.has_contacts and dynamics is None)
         self.limits, self._v_shape = limits or Limits(), (scene.robot.model.nv,)
         self.avoidance, self._no_backup = within_contacts(avoidance or Avoidance(), self.has_contacts, bool(dynamics))
         torques, bounds = make_dynamics(
@@ -132,7 +132,7 @@ class Controller(SceneChanges, SplitStep):
 
     @solver.setter
     def solver(self, law: Solver) -> None:
-        check_solver(law, self.has_contacts)
+        check_solver(law, self.has_contacts and self._builder.rows.dynamics is None)
         self._arbiter.solver = law
         self._builder.rows.adapt(law, self.avoidance.look_ahead)
         if self._planning is not None:
@@ -232,8 +232,7 @@ class Controller(SceneChanges, SplitStep):
         if step.is_plain and self._planning is None and self._arbiter.accepts(step.t):
             middle, v = perf_counter(), builder.rows.v.copy()
             builder.remember(v)
-            solution = Solution.solved(v, middle - begin, perf_counter() - middle)
-            return solution._replace(assumptions=step.assumptions) if step.assumptions else solution
+            return Solution.solved(v, step.assumptions, middle - begin, perf_counter() - middle)
         return self._decide(step, begin)
 
     def tick(

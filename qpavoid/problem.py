@@ -284,16 +284,16 @@ class Solution(NamedTuple):
         return self._replace(status=status, reasons=(*self.reasons, *reasons))
 
     @classmethod
-    def solved(cls, v: Array, build_time: float = 0.0, solve_time: float = 0.0) -> Solution:
-        """Return the solution of a velocity (nv,) and its times [s], in half of the time that `Solution` takes."""
-        return tuple.__new__(cls, (v, *_DEFAULTS, build_time, solve_time))
+    def solved(cls, v: Array, assumed: tuple[Reason, ...] = (), build: float = 0.0, solve: float = 0.0) -> Solution:
+        """Return the solution of v (nv,), with assumptions and times [s], in half of the time that `Solution` takes."""
+        return tuple.__new__(cls, (v, *_HEAD, assumed, *_TAIL, build, solve))
 
     def with_times(self, build_time: float, solve_time: float) -> Solution:
         """Return the solution with its times [s]; see the fields."""
         return tuple.__new__(Solution, (*self[:-2], build_time, solve_time))  # a fifth of the time of `_replace`
 
 
-_DEFAULTS = Solution(np.zeros(0))[1:-2]
+_HEAD, _TAIL = Solution(np.zeros(0))[1:6], Solution(np.zeros(0))[7:-2]
 
 
 def as_numbers(name: str, value: Any) -> Array:

@@ -56,6 +56,9 @@ class ReasonKind(str, Enum):
     HOLDING_RELAXED = "HOLDING_RELAXED"
     """Gravity takes more of a joint's torque than it should, or soon will: the joint, by how much faster than its row
     allows, as a share of its limit [1/s]."""
+    BALANCE_RELAXED = "BALANCE_RELAXED"
+    """The capture point leaves what the robot stands on, or comes nearer to its edges than `support_margin`: by how
+    much its row is violated [m/s]."""
     STALLED = "STALLED"
     """The tasks make no progress: a pair that holds them, its share of the forces that balance their pull on the joints
     [%], more than 10; no share of laws without rows, no pair where several hold them together."""
@@ -144,6 +147,7 @@ _TEXTS: dict[str, str] = {
     "AT_FRICTION_LIMIT": "a force of the contact is at the limit of its cone",
     "TORQUE_SATURATED": "torque limit cuts",
     "HOLDING_RELAXED": "gravity takes too much of its torque, row relaxed by",
+    "BALANCE_RELAXED": "balance row relaxed by",
     "STALLED": "no progress",
     "OUT_OF_REACH": "out of reach by",
     "SINGULAR": "in a singularity, short of its target by",

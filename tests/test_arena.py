@@ -12,6 +12,8 @@ from qpavoid.run.simulate import simulate
 from qpavoid_bench.arena.case import Case, Sensor, SensorModel
 from qpavoid_bench.arena.checker import Contact, Findings, check_run
 from qpavoid_bench.arena.entrants import ENTRANTS
+from qpavoid_bench.arena.families import load_family
+from qpavoid_bench.arena.families import make_case as make_torque_case
 from qpavoid_bench.arena.rollout import Rollout, roll_out
 from qpavoid_bench.arena.scores import COLUMNS, score
 from qpavoid_bench.arena.trial import run_trial
@@ -220,10 +222,45 @@ def test_trial_separates_avoidance_from_tracking():
     assert tracking.case == qp.case and tracking.settings != qp.settings
 
 
-def test_case_without_joints_is_refused():
-    """Cases that no entrant could be given are refused."""
-    with pytest.raises(ConfigError, match=r"humanoid_reach.*neither contacts nor obstacles that are carried"):
-        build_world(load_scenario("humanoid_reach"))
+def test_a_plant_moves_an_arm_whose_torques_are_within_limits():
+    case = make_torque_case(load_family("torque_arm"), 0)
+    case = replace(case, scenario=case.scenario.model_copy(update={"duration": 0.2}))
+    world = build_world(case.scenario)
+    rollout = roll_out(case, ENTRANTS["qp"].start(case, world), world)
+    assert rollout.torque.shape == (201, 7) and not rollout.failed.any() and rollout.fallen == 0.0
+    row = run_trial(case, ENTRANTS["qp"])
+    assert 0.1 < row.torque <= 1.0 and row.torque_jitter > 0.0 and row.slip == row.fallen == 0.0
+    assert not row.collided and row.violations == 0.0
+
+
+def test_a_humanoid_that_is_not_held_falls_and_its_run_ends():
+    """With the torques of zero velocity commanded for ever, it falls; who gives no torques fails at every step."""
+    case = make_torque_case(load_family("standing_humanoid"), 0)
+    scenario = case.scenario.model_copy(update={"duration": 1.5})
+    case = replace(case, scenario=scenario)
+    world = build_world(scenario)
+
+    class Limp:
+        def step(self, q, t, targets, obstacles, v):
+            return Solution(np.zeros(35), torque=np.zeros(29))
+
+    rollout = roll_out(case, Limp(), world)
+    assert 0.0 < rollout.fallen < 0.9 and len(rollout.t) == round((1.0 - rollout.fallen) * 1501)
+    model = build(world.scene, world.q0)
+    findings = check_run(model, rollout.t, rollout.v, scenario.limits, 0.0, rollout.q)
+    np.testing.assert_array_equal(findings.q, rollout.q)
+    row = score(case, world, "x", "y", rollout, findings, 0.0)
+    assert not row.success and row.fallen == rollout.fallen and row.torque == 0.0
+    rollout = roll_out(case, Constant(np.zeros(35)), world)
+    assert rollout.failed.all() and "unexpected keyword argument 'v'" in rollout.failure
+
+
+@pytest.mark.parametrize("contacts", [True, False])
+def test_contacts_and_torques_need_a_plant(contacts):
+    """Cases that cannot be checked are refused."""
+    scenario = load_scenario("g1_wave", ["plant=null"] + ["contacts=[]"] * (not contacts))
+    with pytest.raises(ConfigError, match="plant"):
+        build_world(scenario)
 
 
 def test_every_installed_entrant_runs():

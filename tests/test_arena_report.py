@@ -25,7 +25,7 @@ from qpavoid_bench.arena.scores import COLUMNS
 from qpavoid_bench.arena.statistics import duel, mean, median, pareto, ranks, rate
 from qpavoid_bench.arena.store import Store
 from qpavoid_bench.arena.tables import COLUMNS as SHOWN
-from qpavoid_bench.arena.tables import MORE
+from qpavoid_bench.arena.tables import MORE, MOTORS
 
 flags = st.lists(st.booleans(), min_size=1, max_size=30)
 
@@ -36,6 +36,7 @@ def row(entrant="qp", case="a", family="field", success=True, **more):
     given = {"entrant": entrant, "case": case, "family": family, "success": success, "settings": f"of {entrant}"}
     return {
         **{name: blank[kind] for name, kind in COLUMNS.items()},
+        "torque": 0.0,
         "robot": "panda",
         "reachable": True,
         "seed": int.from_bytes(case.encode()[-6:], "big"),  # another case, another seed
@@ -72,6 +73,15 @@ def cells(lines):
     rows = [re.split(r" (?<!\\)\| ", line[2:-2]) for line in lines if line.startswith("|")]
     heads = [i for i, row in enumerate(rows) if row[0] == "---"]
     return [row for i, row in enumerate(rows) if i not in heads and i + 1 not in heads]
+
+
+def test_runs_with_motors_have_figures_of_them():
+    with_motors, without = (sections(grid(["qp", "eq10"], torque=torque)) for torque in (0.5, 0.0))
+    for column in MOTORS:
+        assert any(column.heading in line for line in with_motors["Overall"])
+        assert not any(column.heading in line for line in without["Overall"])
+    assert "torque motors" in with_motors["Limits of the comparison"][1]
+    assert "followed exactly" in without["Limits of the comparison"][1]
 
 
 # --- statistics -----------------------------------------------------------------------------------------------------
@@ -289,7 +299,7 @@ def test_report_counts_failures():
 def test_report_units():
     """A column's scale is that from the unit of the score to the unit of its heading."""
     score_units = {"[mm]": ("[m]", 1e3), "[%]": ("", 100.0), "[µs]": ("[µs]", 1.0)}
-    for column in (*SHOWN, *MORE):
+    for column in (*SHOWN, *MORE, *MOTORS):
         unit = re.search(r"\[.*\]", column.heading)[0]
         assert column.name in COLUMNS
         assert column.scale == score_units.get(unit, (unit, 1.0))[1], column.heading

@@ -6,7 +6,7 @@ import pytest
 from closed_loop import SHIPPED, Ruler, cartesian, changed, make_controller
 
 from qpavoid import Avoidance, Controller, Limits, Obstacle, ReasonKind, Sample, Status, load_scenario
-from qpavoid.config import Box, Line, Sphere
+from qpavoid.config import Box, Circle, Line, Sphere
 from qpavoid.model.trajectory import build_motion
 from qpavoid.safety.rollout import BackupRollouts
 
@@ -103,6 +103,17 @@ def test_without_backup_they_trap_the_robot(tmp_path, filtered):
         assert (gaps(controller, states).min() < 0.0) == (not backup)
 
 
+@pytest.mark.parametrize(("at", "rate"), [(0.5, 1.0), (0.8, 1.8)])
+def test_an_obstacle_on_a_circle_is_evaded_though_only_samples_tell_of_it(tmp_path, at, rate):
+    """A ball of 0.3 m comes round through the origin; predicted on straight lines, it touches: by 42 and 256 mm."""
+    motion = Circle(center=(0, at, 0), radius=at, period=2 * np.pi / rate, normal=(0, 0, 1), start_direction=(0, 1, 0))
+    ball = Obstacle("ball", Sphere(radius=0.3), build_motion(motion, None, SHIPPED.parent), True)
+    controller = controller_of(tmp_path, [ball])
+    states = loop(controller, 400, external=True)
+    least = min(np.linalg.norm(q - ball.motion.sample(k * DT).position[:2]) for k, (q, _) in enumerate(states))
+    assert least - 0.3 - 0.05 > 0.9 * KEPT
+
+
 # --- a press with one exit -----------------------------------------------------------------------------------------
 
 
@@ -178,7 +189,7 @@ def test_an_attached_object_is_moved_out_of_the_way_too(tmp_path):
 # --- bounded work --------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("dt", "poses"), [(0.01, 100), (0.002, 15)])
+@pytest.mark.parametrize(("dt", "poses"), [(0.01, 114), (0.002, 17)])
 def test_work_of_a_step_is_bounded(tmp_path, evaluations, dt, poses):
     """So many poses, whatever is searched for; a trajectory takes 41 to 82."""
     controller, most = controller_of(tmp_path, press(), speed=0.4, dt=dt), 0
@@ -197,7 +208,7 @@ def test_an_obstacle_that_appears_near_is_evaded_within_the_same_bound(tmp_path,
         center = np.array([1.0 - dt * (k - 100), 0.01, 0.0])
         updates = {"ball": Sample.at(center, linear=[-1.0, 0.0, 0.0])} if k >= 100 else None
         solution = controller.step(q, dt * k, TARGET, updates)
-        assert len(evaluations) <= 15
+        assert len(evaluations) <= 17
         assert k > 100 or solution.status is Status.SOLVED  # until a backup trajectory is known, the task goes on
         evaluations.clear()
         q = q + dt * solution.v

@@ -123,9 +123,17 @@ def test_hulls_are_those_of_coal(panda_convex):
         np.testing.assert_allclose(got[expected > 0.0], expected[expected > 0.0], atol=1e-4)
 
 
-def test_a_floating_base_is_refused(solo):
-    with pytest.raises(ValueError, match="neither a hinge nor a slide"):
-        build(random_scene(solo, np.random.default_rng(0), [SPHERE]), solo.home)
+def test_a_floating_base_is_placed_but_not_integrated(solo):
+    scene, rng = random_scene(solo, np.random.default_rng(0), [SPHERE]), np.random.default_rng(1)
+    mujoco_model, v = build(scene, solo.home), np.zeros(solo.model.nv)
+    for _ in range(3):
+        q = pin.integrate(solo.model, solo.home, rng.uniform(-0.5, 0.5, len(v)))
+        mujoco_model.place(q, 0.0)
+        expected = coal_distances(scene, q)
+        got = np.array([mujoco_model.distance(pair) for pair in range(len(expected))])
+        np.testing.assert_allclose(got[expected > 0.0], expected[expected > 0.0], atol=1e-4)
+    with pytest.raises(ValueError, match="floats"):
+        mujoco_model.integrate(solo.home, v, 0.01)
 
 
 # --- the checker --------------------------------------------------------------------------------------------

@@ -4,7 +4,8 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from qpavoid import Robot
+from qpavoid import Robot, build_contacts
+from qpavoid.config import Contact
 from qpavoid.kernels.contact_forces import (
     cone_rows,
     eliminate_base,
@@ -13,6 +14,7 @@ from qpavoid.kernels.contact_forces import (
     standing_dynamics,
 )
 from qpavoid.kernels.orthogonal import factorise_rows, solve_rows
+from qpavoid.model.kinematics import ForwardKinematics
 
 DT, SCALE = 1e-3, 0.03
 CORNERS = np.array([[-0.05, 0.025, -0.035], [-0.05, -0.025, -0.035], [0.12, 0.03, -0.035], [0.12, -0.03, -0.035]])
@@ -45,6 +47,30 @@ def standing():
         "model": model, "q": q, "v": v, "M": M, "h": h, "J": J.reshape(12, -1), "b": b, "Jp": Jp, "ids": ids,
         "Z": Z, "rest": rest, "X": X, "start": start, "Y": Y, "N": N,
     }  # fmt: skip
+
+
+def test_contact_rows_bring_frames_back(standing):
+    """Jacobians of pinocchio, the gain times what is missing, of a surface and a point; none off the ground."""
+    robot, (foot, other), rng = Robot.load("g1"), FEET, np.random.default_rng(4)
+    contacts = build_contacts([Contact(frame=foot, gain=5.0), Contact(frame=other, type="point")], robot, robot.home)
+    model, data = robot.model, robot.model.createData()
+    kinematics = ForwardKinematics(model, contacts.frame_ids)
+    pin.framesForwardKinematics(model, data, robot.home)
+    rest = [data.oMf[i].copy() for i in contacts.frame_ids]
+    q = pin.integrate(model, robot.home, rng.normal(scale=1e-4, size=model.nv))
+    kinematics.compute(q)
+    pin.computeJointJacobians(model, data, q)
+    pin.updateFramePlacements(model, data)
+    J = [pin.getFrameJacobian(model, data, i, pin.LOCAL_WORLD_ALIGNED) for i in contacts.frame_ids]
+    now = [data.oMf[i] for i in contacts.frame_ids]
+    turn = pin.log3(rest[0].rotation @ now[0].rotation.T)
+    b = np.concatenate((5.0 * (rest[0].translation - now[0].translation), 5.0 * turn))
+    found = contacts.update(kinematics)
+    np.testing.assert_allclose(found.J, np.concatenate((J[0], J[1][:3])), atol=1e-12)
+    np.testing.assert_allclose(found.b, [*b, *(10.0 * (rest[1].translation - now[1].translation))], atol=1e-12)
+    contacts.switch([other], 0.0)
+    contacts.advance(DT, kinematics)
+    np.testing.assert_allclose(contacts.update(kinematics).J, J[1][:3], atol=1e-12)
 
 
 @pytest.mark.parametrize(("rows", "n", "dependent"), [(6, 24, 0), (12, 35, 0), (9, 20, 5), (20, 20, 0), (24, 10, 0)])

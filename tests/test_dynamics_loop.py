@@ -76,6 +76,15 @@ def test_dive_at_a_table_brakes_in_time(fraction):
 
 
 @pytest.mark.slow
+def test_without_holding_rows_the_arm_falls_onto_the_table():
+    """Motors of 70 %, 20 % of the masses unknown: what braking needs is no longer there once gravity takes it."""
+    _, closest, figures = play(
+        "panda_dive", ["dynamics.torque_limits=0.7", "dynamics.holding_fraction=null"], mass_scale=1.2
+    )
+    assert closest < 0.0 and figures["severity_counts"]["ALARM"] > 0
+
+
+@pytest.mark.slow
 def test_panda_with_jerk_limits_avoids_the_ball():
     log, closest, figures = play("panda_torque", ["limits.jerk=3000"])
     assert closest >= D1 - 0.5e-3

@@ -101,7 +101,7 @@ class Faulty(worker.InlineWorker):
             case "NaN":
                 path.q[:] = np.nan
             case "shape":
-                return answer._replace(outcome=outcome._replace(forecast=outcome.forecast._replace(q=np.zeros((3, 2)))))
+                return answer._replace(outcome=outcome._replace(expected=outcome.expected._replace(q=np.zeros((3, 2)))))
             case "silent":
                 return None
         return answer

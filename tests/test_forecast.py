@@ -38,7 +38,7 @@ def make_forecaster(scenario):
     settings = ControlSettings(parts.scene, bounds, avoidance, scenario.limits, scenario.dt)
     forecaster = Forecaster(settings, parts.tasks, parts.contacts, scenario.solver, Planning())
     zero = np.zeros(parts.scene.robot.model.nv)
-    return forecaster, Snapshot(0.0, parts.q0, zero, zero, TRACK, {}, {})
+    return forecaster, Snapshot(0.0, parts.q0, zero, zero, TRACK, {}, {}, {})
 
 
 def forecast(scenario):

@@ -42,9 +42,6 @@ def compare(model, q):
     for i in ids:
         J = pin.getFrameJacobian(model, data, i, pin.LOCAL_WORLD_ALIGNED)
         np.testing.assert_allclose(kinematics.frame_jacobian(i), J, rtol=0, atol=1e-12)
-    center, J = kinematics.center_of_mass()
-    np.testing.assert_allclose(J, pin.jacobianCenterOfMass(model, data, q), rtol=0, atol=1e-12)
-    np.testing.assert_allclose(center, data.com[0], rtol=0, atol=1e-12)
     return kinematics
 
 
@@ -80,10 +77,7 @@ def test_kinematics_of_every_kind_of_joint(seed):
     rng = np.random.default_rng(seed)
     model = chain(rng)
     q = pin.integrate(model, pin.neutral(model), rng.uniform(-2.0, 2.0, model.nv))
-    kinematics = compare(model, q)
-    _, J = kinematics.center_of_mass()
-    moved = differences(model, kinematics, q, lambda x: x.center_of_mass()[0])
-    np.testing.assert_allclose(J, moved, rtol=0, atol=1e-7)
+    compare(model, q)
     assert columns(model).tolist() == list(range(model.nv))
 
 

@@ -54,6 +54,7 @@ def log():
         status=[STATUSES.index(s) for s in ("SOLVED", "RELAXED", "RELAXED", "STOPPED", "SOLVED")],
         command_scale=[1.0, 0.5, 1.0, 0.0, 1.0],
         stalled=np.array([False, False, True, True, True]),
+        planned=np.zeros(5, dtype=bool),
         severity=np.array([0, Severity.WARNING, Severity.WARNING, Severity.ALARM, Severity.INFO], dtype=np.int8),
         build_time=np.array([4, 5, 6, 7, 8]) * 1e-6,
         solve_time=np.array([6, 15, 24, 33, 92]) * 1e-6,

@@ -20,6 +20,7 @@ from qpavoid.viz.motion import instants, motion_figure, sight_of
 from qpavoid.viz.raster import Canvas, Projection
 from qpavoid.viz.robot_pictures import RobotPictures
 from qpavoid.viz.surfaces import inflated_outline, shape_faces
+from qpavoid.viz.torque_figures import torque_figures
 
 LIMITS = ((2.175, 4), (2.61, 3))
 """Speed limits of a Panda [rad/s], and of how many joints."""
@@ -260,3 +261,24 @@ def test_page_shows_every_figure_the_table_and_the_settings(sphere, panda, tmp_p
         assert f"<td>{log.meta['solver']}</td>" in text
         assert f"d1: {log.meta['config']['avoidance']['d1']}" in text
     assert f"<td>{1e3 * panda.metrics()['min_distance']:.1f}</td>" in text
+
+
+def test_figures_of_a_robot_that_stands_show_torques_between_limits_and_forces_in_cones(panda, tmp_path):
+    pytest.importorskip("mujoco")
+    log = simulate(load_scenario("g1_wave", ["duration=0.05"]))
+    figures = torque_figures(log)
+    assert list(figures) == ["torques", "contacts"] and not torque_figures(panda)
+    panels = {ax.get_title(): ax.get_lines() for ax in figures["torques"].axes}
+    assert len(panels) == 29
+    torque, *limits = panels["left_knee_joint"]
+    assert_allclose(torque.get_ydata(), log.torque[:, log.meta["coordinates"][6:].index("left_knee_joint")])
+    assert sorted(line.get_ydata()[0] for line in limits) == [-139.0, 139.0]
+    cones, bearing, slip = figures["contacts"].axes
+    slopes = [line.get_ydata()[1] / line.get_xdata()[1] for line in cones.get_lines()[2:]]
+    assert_allclose(slopes, [0.5, 0.7])
+    weight = sum(line.get_ydata() for line in bearing.get_lines())
+    assert_allclose(weight, log.contact_force[:, :, 2].sum(axis=1))
+    assert len(slip.get_lines()) == 8
+    paths = plot_run(log, tmp_path)
+    assert [path.stem.rpartition("_")[2] for path in paths[-2:]] == ["torques", "contacts"]
+    assert all(f'"{path.name}"' in write_index([log], paths, tmp_path).read_text() for path in paths)

@@ -1,11 +1,25 @@
 """What plans promise in a closed loop: nothing changes where the law arrives, and the rest costs the plan alone."""
 
+import numpy as np
 import pytest
 
+from qpavoid import Controller, Obstacle, Points, Sample, build_scene, build_tasks
+from qpavoid.config import Box, Capsule, Planning, PointCloud, Task
+from qpavoid.planning import worker
 from qpavoid_bench.arena.entrants import ENTRANTS
 from qpavoid_bench.arena.families import load_family, make_case
 from qpavoid_bench.arena.rollout import roll_out
+from qpavoid_bench.arena.trial import run_trial
 from qpavoid_bench.arena.world import build_world
+
+LATE = (
+    ("situation2", (4,)),
+    ("random_walk", (0, 7, 8, 9, 11)),
+    ("noisy_sensor", (7, 8)),
+    ("chasing", (2,)),
+    ("head_on", (6,)),
+)
+"""Cases of the suite `full` with obstacles that move in which `qp` does not arrive."""
 
 
 def roll(case, entrant="qp-planning"):
@@ -31,3 +45,104 @@ def test_where_the_law_arrives_commands_are_those_of_the_law(family, seed):
     """Bit for bit, with hulls, whose distances start from those of the step before, too."""
     case = make_case(load_family(family), seed)
     assert roll(case).v.tobytes() == roll(case, "qp").v.tobytes()
+
+
+class Counted(worker.InlineWorker):
+    """A worker that counts the looks."""
+
+    looks = 0
+
+    def ask(self, question):
+        super().ask(question)
+        type(self).looks += 1
+
+
+@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.slow), pytest.param(2, marks=pytest.mark.slow)])
+def test_robot_comes_to_rest_where_the_goal_is_out_of_reach(seed, monkeypatch):
+    """Without contact, and with ever fewer looks: 8 at most in 10 s."""
+    monkeypatch.setattr(Counted, "looks", 0)
+    monkeypatch.setattr(worker, "InlineWorker", Counted)
+    case = make_case(load_family("unreachable"), seed)
+    result = run_trial(case, ENTRANTS["qp-planning"])
+    assert result.success
+    assert 1 <= Counted.looks <= 8 * max(1.0, case.scenario.duration / 10.0)
+
+
+@pytest.mark.slow
+def test_among_obstacles_that_move_half_of_what_the_law_fails_at_arrives():
+    results = [run_trial(make_case(load_family(f), s), ENTRANTS["qp-planning"]) for f, seeds in LATE for s in seeds]
+    assert sum(result.success for result in results) >= 5
+    assert sum(result.collided for result in results) <= 1
+
+
+WALL = np.array([[x, 0.2, z] for x in np.arange(0.15, 0.75, 0.02) for z in np.arange(0.2, 0.75, 0.02)])
+"""A board of points between a Panda's tool and where it should go [m]."""
+
+
+def beside_a_cloud(panda, **planning):
+    """A controller whose tool should go to the other side of what a camera sees, and its target."""
+    scene = build_scene(panda, [Obstacle.at("camera", PointCloud(resolution=0.02), [0, 0, 0], external=True)])
+    tasks = build_tasks([Task(frame="panda_hand_tcp", type="position")], panda, panda.home)
+    return Controller(scene, tasks, planning=Planning(settle=4.0, **planning))
+
+
+def drive(controller, q, steps, targets, points):
+    """Solutions of a loop that is given a picture at every tenth step, and where the tool is at its end [m]."""
+    solutions = []
+    for k in range(steps):
+        picture = {"camera": Points(points, at_rest=True)} if k % 10 == 0 else None
+        tick = controller.tick(q, k * controller.dt, targets, picture)
+        solutions.append(tick.solution)
+        q = q + controller.dt * tick.solution.v
+    return solutions, tick.kinematics.position[0].copy(), q
+
+
+@pytest.mark.slow
+def test_points_of_a_camera_are_in_forecasts(panda):
+    """The law is stopped by a board of points; that is forecast, and a path leads around it."""
+    target = {"panda_hand_tcp": Sample.at([0.45, 0.4, 0.5], np.eye(3))}
+    _, tool, _ = drive(beside_a_cloud(panda, fast=None, clearances=[]), panda.home, 400, target, WALL)
+    assert np.linalg.norm(tool - target["panda_hand_tcp"].position) > 0.05
+    solutions, tool, _ = drive(beside_a_cloud(panda), panda.home, 400, target, WALL)
+    (plan,) = {solution.plan for solution in solutions} - {""}
+    assert plan.startswith("path from ") and "camera" in plan
+    assert np.linalg.norm(tool - target["panda_hand_tcp"].position) < 5e-3
+
+
+@pytest.mark.slow
+def test_process_knows_what_is_attached_and_may_touch(panda, monkeypatch):
+    """A stick in the hand is part of the robot there: a loop that waits for answers does what the step would do."""
+    stick = Obstacle.at("stick", Capsule(radius=0.01, length=0.3), [0.307, 0.0, 0.487], graspable=True)
+    board = Obstacle.at("board", Box(size=(0.3, 0.02, 0.5)), [0.45, 0.22, 0.5])
+    answers = {}
+    for name in ("inline", "process"):
+        monkeypatch.setattr(worker, "ProcessWorker", Awaited)
+        tasks = build_tasks([Task(frame="panda_hand_tcp", type="position")], panda, panda.home)
+        controller = Controller(build_scene(panda, [stick, board]), tasks, planning=Planning(settle=4.0, worker=name))
+        controller.allow_contact("stick", ["panda_hand_0", "panda_leftfinger_0", "panda_rightfinger_0"])
+        controller.attach("stick", "panda_hand_tcp", panda.home)
+        q, solutions = panda.home, []
+        target = {"panda_hand_tcp": Sample.at([0.45, 0.45, 0.5], np.eye(3))}
+        for k in range(150):
+            solutions.append(controller.step(q, k * controller.dt, target))
+            q = q + controller.dt * solutions[-1].v
+        answers[name] = [solution.v.tobytes() for solution in solutions], [solution.plan for solution in solutions]
+    assert answers["inline"] == answers["process"]
+    assert any(answers["inline"][1])
+
+
+class Awaited(worker.ProcessWorker):
+    """A process whose answers a step waits for."""
+
+    is_asked = False
+
+    def ask(self, question):
+        super().ask(question)
+        self.is_asked = True
+
+    def poll(self):
+        answer = None
+        while self.is_asked and answer is None and self.process.poll() is None:
+            answer = super().poll()
+        self.is_asked = False
+        return answer or super().poll()

@@ -126,11 +126,13 @@ def controller(g1):
     return make_controller(g1)
 
 
-def test_torques_and_forces_obey_the_equations_of_motion(g1, controller):
+@pytest.mark.parametrize("solver", ["qp", "hqp"])
+def test_torques_and_forces_obey_the_equations_of_motion(g1, controller, solver):
     """τ = rnea(q, v, a) - Jcᵀ f to 1e-9, nothing drives the base, forces lie in their cones, SOLVED."""
     model, rng = g1.model.copy(), np.random.default_rng(0)
     model.armature = np.concatenate((np.zeros(6), np.full(29, 0.01)))
     data, solved = model.createData(), 0
+    controller = controller if solver == "qp" else make_controller(g1, solver, priorities=(1, 2))
     for _ in range(5):
         q = pin.integrate(model, g1.home, np.concatenate((np.zeros(6), rng.normal(scale=0.01, size=29))))
         v = rng.normal(scale=0.02, size=35)
@@ -153,6 +155,47 @@ def test_torques_and_forces_obey_the_equations_of_motion(g1, controller):
         np.testing.assert_allclose(torque[6:], solution.torque, atol=1e-9)
         np.testing.assert_allclose(solution.v, v + DT * solution.acceleration, atol=1e-12)
     assert solved == 5
+
+
+def test_the_compiled_step_is_the_one_of_the_problem(g1, controller):
+    """The step in one call, against the problem in all velocities and impulses with daqp, where rows bind or do not."""
+    general, rng, distance, solved = make_controller(g1, "qp:daqp"), np.random.default_rng(1), [], 0
+    model, data = g1.model, g1.model.createData()
+    for _ in range(16):
+        q = pin.integrate(model, g1.home, np.concatenate((np.zeros(6), rng.normal(scale=0.01, size=29))))
+        pin.framesForwardKinematics(model, data, q)
+        hand = data.oMf[model.getFrameId(HAND)].translation
+        ball = {"ball": Sample.at(hand + np.array([0.148, 0.0, rng.uniform(-0.05, 0.05)]), linear=[-0.2, 0.0, 0.0])}
+        target, v = {HAND: Sample.at(hand + rng.normal(scale=0.1, size=3))}, rng.normal(scale=0.01, size=35)
+        answers = []
+        for each in (controller, general):
+            each.reset(v)
+            answers.append(each.step(q, 0.0, target, ball, v))
+        one, other = answers
+        assert one.status is other.status
+        if one.status is Status.SOLVED:
+            np.testing.assert_allclose(one.v, other.v, rtol=0, atol=1e-8)
+            np.testing.assert_allclose(one.torque, other.torque, rtol=0, atol=1e-3)
+            for frame in FEET:
+                np.testing.assert_allclose(one.forces[frame], other.forces[frame], rtol=0, atol=1e-2)
+            solved += 1
+        problem = general.rows(q, obstacles=ball, v=v)
+        distance.append(float((problem.avoidance.J @ one.v - problem.avoidance.b).min()))
+    assert solved > 8 and min(distance) < 1e-6
+
+
+@pytest.mark.parametrize("solver", ["qp", "hqp"])
+def test_limits_of_torque_hold_in_every_priority(g1, solver):
+    """A hand that is asked for more than motors give: some are at their limits, none beyond, contacts are held."""
+    controller = make_controller(g1, solver, priorities=(1, 2), torque_limits=0.1, tracking_rate=1000.0)
+    limit, at_limit = 0.1 * g1.model.effortLimit[6:], 0
+    for seed in range(6):
+        controller.reset()
+        target = np.random.default_rng(seed).uniform(-1.0, 1.0, 3)
+        solution = controller.step(g1.home, 0.0, {HAND: target}, v=np.zeros(35))
+        assert (np.abs(solution.torque) <= limit + 1e-9).all()
+        at_limit += solution.status is Status.SOLVED and bool((np.abs(solution.torque) > 0.99 * limit).any())
+    assert at_limit > 2
 
 
 def test_it_stands(g1, controller):
@@ -195,6 +238,13 @@ def test_a_contact_that_leaves_bears_less_until_it_is_free(g1, controller):
     controller.set_contacts(FEET, 0.0)
     controller.step(g1.home, 23 * DT, v=np.zeros(35))
     assert controller.step(g1.home, 24 * DT, v=np.zeros(35)).forces[FEET[0]][:, 2].max() > 20.0
+
+
+def test_a_law_that_holds_no_contacts_stands_too(g1):
+    """Eq. 10 on motions that move no contact: torques within their limits, feet at rest, forces that carry it."""
+    controller = make_controller(g1, "eq10")
+    run = play(g1, controller, 0.05)
+    assert not run.has_fallen and run.slip < 1e-3 and set(run.statuses) == {"SOLVED"}
 
 
 @pytest.mark.slow

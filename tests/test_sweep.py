@@ -241,9 +241,9 @@ def test_digest_changes_with_settings_and_families(folder):
 
 
 def test_suites_that_ship():
-    """The three largest together have all families with a proof, and all entrants."""
+    """The four largest together have all families with a proof, and all entrants."""
     assert all(load_suite(name).seeds for name in shipped_names("suite"))
-    large = [load_suite(name) for name in ("full", "teleoperation", "noise")]
+    large = [load_suite(name) for name in ("full", "teleoperation", "noise", "torque")]
     proved = {name for name in shipped_names("family") if load_family(name).config.proved}
     assert {family.name for suite in large for family in suite.families} == proved
     assert {entrant.name for suite in large for entrant in suite.entrants + suite.absent} == set(ENTRANTS)

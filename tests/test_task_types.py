@@ -89,6 +89,33 @@ def test_com_rows_agree_with_finite_differences(case):
         np.testing.assert_allclose(bench.rows(q)[0], np.concatenate((expected, 3.0 * expected[:2])), atol=3e-6)
 
 
+def test_momentum_rows_agree_with_finite_differences(case):
+    """Of every body, m (c - c_all) × ċ + I ω, by where it is a little before and after."""
+    robot, _, configurations = case
+    bench, model, h = task_bench(robot, config.MomentumTask(weight=4.0, angular=(1.0, 0.0, -2.0))), robot.model, 1e-6
+    bodies = range(1, model.njoints)
+
+    def at(q):
+        data = model.createData()
+        pin.centerOfMass(model, data, q)
+        pin.forwardKinematics(model, data, q)
+        return data
+
+    for q in configurations:
+        A, b = bench.rows(q)
+        now, expected = at(q), np.zeros((3, model.nv))
+        for j, e in enumerate(np.eye(model.nv)):
+            before, after = at(pin.integrate(model, q, -h * e)), at(pin.integrate(model, q, h * e))
+            for i in bodies:
+                body, pose = model.inertias[i], now.oMi[i]
+                speed = (after.oMi[i].act(body.lever) - before.oMi[i].act(body.lever)) / (2.0 * h)
+                turn = pin.log3(after.oMi[i].rotation @ before.oMi[i].rotation.T) / (2.0 * h)
+                inertia = pose.rotation @ body.inertia @ pose.rotation.T
+                expected[:, j] += np.cross(pose.act(body.lever) - now.com[0], body.mass * speed) + inertia @ turn
+        np.testing.assert_allclose(A, 2.0 * expected, atol=1e-6)
+        np.testing.assert_allclose(b, [2.0, 0.0, -4.0])
+
+
 def test_posture_and_damping_rows_are_rates_of_coordinates(case):
     robot, _, configurations = case
     bench = task_bench(robot, config.PostureTask(weight=4.0), config.DampingTask())

@@ -24,6 +24,7 @@ EVERY_KIND = [
     config.Task(frame="panda_link6", type="orientation", orientation_weight=0.1, name="turn"),
     config.RelativeTask(frame="panda_hand", relative_to="panda_link3", weight=0.2),
     config.ComTask(weight=0.3),
+    config.MomentumTask(weight=0.1),
     config.PostureTask(weight=0.1),
     config.DampingTask(weight=0.01),
     config.LookAtTask(frame="panda_hand", motion=config.Fixed(position=(0.6, 0.2, 0.1)), weight=0.2),

@@ -105,6 +105,9 @@ class Dynamics(Block):
     change during a stop."""
     holding_fraction: Fraction | None = 0.6
     """Share of these torques that gravity may take [-], below `braking_fraction`; `null`: rows do not keep to it."""
+    support_margin: NonNegative | None = None
+    """Of a robot that stands: least distance of its capture point from the edges of what it stands on [m]; `null`: rows
+    do not keep to it."""
     tracking_rate: Positive = 100.0
     """k_v [1/s]: the rate at which the measured velocity approaches the one that the tasks ask for. A task of gain K
     then has the stiffness K k_v and the damping k_v."""

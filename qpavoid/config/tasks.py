@@ -81,6 +81,14 @@ class ComTask(TaskBlock):
     """Feedback gain K [1/s]."""
 
 
+class MomentumTask(TaskBlock):
+    """The angular momentum of the whole robot about its centre of mass: arms swing against legs."""
+
+    type: Literal["momentum"] = "momentum"
+    angular: Vec3 = (0.0, 0.0, 0.0)
+    """What it is to be, world [kg m²/s]; with `dynamics`, it is approached at `tracking_rate`."""
+
+
 class PostureTask(TaskBlock):
     """Joints go to a posture: v = gain (q_ref ⊖ q)."""
 
@@ -147,7 +155,15 @@ def _position_unless_said(value: Any) -> Any:
 
 AnyTask = Annotated[
     Annotated[
-        Task | RelativeTask | ComTask | PostureTask | DampingTask | LookAtTask | AlignTask | ManipulabilityTask,
+        Task
+        | RelativeTask
+        | ComTask
+        | MomentumTask
+        | PostureTask
+        | DampingTask
+        | LookAtTask
+        | AlignTask
+        | ManipulabilityTask,
         Field(discriminator="type"),
     ],
     BeforeValidator(_position_unless_said),

@@ -178,9 +178,7 @@ class RowAssembler(TrackedVelocities):
             self._task_rows.write(q, self._forward, targets[len(self.targets) :])
         if self._contacts is not None:
             self._contacts.advance(x.dt, self._forward)
-            if self.dynamics is not None:  # from the velocity as measured
-                self._contact_rows = self.dynamics.stand(self._forward, x.v_prev)
-            else:
+            if self.dynamics is None:  # which begins at the velocity as measured, and holds contacts by itself
                 self._contact_rows = resting = self._contacts.update(self._forward)
                 x.v_prev[:] = resting.project(x.v_prev)
         return self._finish()
@@ -235,10 +233,11 @@ class RowAssembler(TrackedVelocities):
     def problem(self) -> Problem:
         """Return the problem of the last step."""
         x, (_, violation, is_clear, position_margin, bent) = self._layout, self._layout.summary.item()
+        contacts = self._contact_rows if self.dynamics is None else self.dynamics.resting
         tracking, levels = (self._tracking, self._levels) if self.follows_tasks else (self._following, ())
         return Problem(
             tracking, self._view()[1], x.lower, x.upper, *self._hard, x.v_stop, self._scene.pair_names,
-            self.joint_names, self.joint_units, x.v_tracking, violation, self._contact_rows, levels, None, bent,
+            self.joint_names, self.joint_units, x.v_tracking, violation, contacts, levels, None, bent,
             x.jerk_limited, is_clear, position_margin, UNLIMITED,
             None if self.dynamics is None else self.dynamics.rows(x.v_prev),
         )  # fmt: skip
@@ -250,15 +249,10 @@ class RowAssembler(TrackedVelocities):
             summary.bent = self._track_within(contacts)
         else:
             x.v_tracking[:] = contacts.project(x.v_tracking)
-        if self.dynamics is None:
-            self.previous.tighten_bounds()
-        elif self.dynamics.approaches[0]:
-            x.v_tracking[:] = self.dynamics.approach(x.v_tracking, x.v_prev)
+        self.previous.tighten_bounds()
         if x.task_switching:
             summary.bent = 0.0
             kernels.row_bounds(self._packed, summary.rows, self.query.is_moving)
-            if self.dynamics is not None:
-                kernels.slow_rows(self._packed, self.dynamics.packed, summary.rows)
         summary.violation = kernels.tracking_violation(self._packed, summary.rows)
 
     def _track_within(self, contacts: Contacts) -> float:

@@ -10,24 +10,21 @@ from __future__ import annotations
 from collections.abc import Collection, Sequence
 from copy import copy
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from qpavoid import config, kernels
-from qpavoid.control.tasks.base import frame_pose
 from qpavoid.errors import ConfigError, require_known
-from qpavoid.kernels.rotation import rotation_vector
-from qpavoid.model.kinematics import ForwardKinematics
+from qpavoid.model.kinematics import ForwardKinematics, columns, support_masks
 from qpavoid.model.robot import Robot
-from qpavoid.problem import Array, Contacts, IntArray
+from qpavoid.problem import Array, Contacts, Mask
 from qpavoid.reason import Reason, ReasonKind
 
 _NO_BACKUP = Reason.of(
     ReasonKind.NO_BACKUP, "contacts", detail="backup trajectories do not hold contacts: avoidance.backup"
 )
 """Assumption where obstacles move and the robot stands on something."""
-_CORRECTION = 0.02
-"""Largest speed at which what has slid is put right [m/s, rad/s]."""
 
 
 def within_contacts(
@@ -49,34 +46,40 @@ class ContactRows:
     """The contacts of a robot, where they rest, and which of them do now."""
 
     def __init__(
-        self, settings: Sequence[config.Contact], frame_ids: Sequence[int], kinematics: ForwardKinematics
+        self, settings: Sequence[config.Contact], frame_ids: Sequence[int], model: Any, kinematics: ForwardKinematics
     ) -> None:
         """Let the frames rest where the kinematics have them; see `build_contacts`."""
         self.settings, self.frame_ids = tuple(settings), tuple(frame_ids)
-        self._anchors = [tuple(part.copy() for part in frame_pose(kinematics, i)) for i in frame_ids]
-        self._gains = np.repeat([contact.gain for contact in settings], 6).reshape(-1, 6)
-        self._rows = np.repeat([(True, contact.type == "surface") for contact in settings], 3, axis=1)
+        self.anchors = kinematics.frame_poses[list(frame_ids)]
+        """(f, 12) where each rests: rotation by columns, then position [m]."""
+        self.gains = np.array([contact.gain for contact in settings])
+        """(f,) feedback on what has slid [1/s]."""
+        self.surfaces: Mask = np.array([contact.type == "surface" for contact in settings])
+        """(f,) whether it may not turn, either."""
         self.shares = np.ones(len(frame_ids))
         """How far each bears what it may [-]: 1 at rest on the ground, 0 off it, between where it comes or leaves."""
+        self.leaves: Mask = np.zeros(len(frame_ids), dtype=bool)
+        """(f,) whether each is about to leave."""
+        self.columns = columns(model)
+        """(e,) see `model.kinematics.columns`."""
+        self.support = support_masks(model)[[model.frames[i].parentJoint for i in frame_ids]]
+        """(f, e) 1 of the columns that move each frame, else 0."""
+        self.jacobians = np.zeros((len(frame_ids), 6, model.nv))
+        """(f, 6, nv) of the frames, in the last step; zero of those that were not active."""
         self._rates = np.zeros(len(frame_ids))
         self._comes = np.zeros(len(frame_ids), dtype=bool)
-        self.jacobians = np.zeros((len(frame_ids), 6, 0))
 
     def own_copy(self) -> ContactRows:
         """Return the same contacts, which come and leave by themselves."""
         own = copy(self)
-        own.take_over(self)
+        for name in ("anchors", "shares", "leaves", "jacobians", "_rates", "_comes"):
+            setattr(own, name, getattr(self, name).copy())
         return own
 
     def take_over(self, other: ContactRows) -> None:
         """Let contacts rest, come and leave as other ones of the same frames do."""
-        self._anchors, self.shares = list(other._anchors), other.shares.copy()
-        self._rates, self._comes = other._rates.copy(), other._comes.copy()
-
-    @property
-    def active(self) -> IntArray:
-        """Return which contacts hold their frames, by number."""
-        return np.flatnonzero((self.shares > 0.0) | self._comes)
+        self.anchors[:], self.shares[:] = other.anchors, other.shares
+        self._rates[:], self._comes[:], self.leaves[:] = other._rates, other._comes, other.leaves
 
     def switch(self, names: Collection[str], duration: float) -> None:
         """Let the contacts of some frames come or stay, and all others leave, over a duration [s].
@@ -88,41 +91,27 @@ class ContactRows:
         for name in names:
             require_known(name, frames, "set_contacts: no contact of")
         for i, frame in enumerate(frames):
-            aim = float(frame in names)
+            aim, self.leaves[i] = float(frame in names), frame not in names
             self._comes[i] |= bool(aim and self.shares[i] == 0.0)
             self._rates[i] = np.sign(aim - self.shares[i]) / max(duration, 1e-9)
 
     def advance(self, dt: float, kinematics: ForwardKinematics) -> None:
         """Go on by a control period dt [s]; a frame that comes rests where the kinematics have it."""
+        if not self._rates.any():
+            return
         for i in np.flatnonzero(self._comes):
-            self._anchors[i] = tuple(part.copy() for part in frame_pose(kinematics, self.frame_ids[i]))
+            self.anchors[i] = kinematics.frame_poses[self.frame_ids[i]]
         self._comes[:] = False
         np.clip(self.shares + dt * self._rates, 0.0, 1.0, out=self.shares)
 
     def update(self, kinematics: ForwardKinematics) -> Contacts:
         """Their rows at the configuration for which the kinematics are up to date, solved."""
-        return solve_contacts(*self.rows(kinematics))
-
-    def rows(self, kinematics: ForwardKinematics) -> tuple[Array, Array]:
-        """Return the rows J (c, nv) and b (c,) of the active contacts: J v = b brings them to where they rest.
-
-        The Jacobians (f, 6, nv) of all contact frames, zero of those that are not active, are `jacobians` afterwards.
-        """
-        active, b = self.active.tolist(), np.zeros((len(self.settings), 6))
-        self.jacobians = np.zeros((len(self.settings), 6, kinematics.frame_jacobian(self.frame_ids[0]).shape[1]))
-        for i in active:
-            (position, rotation), (x, R) = self._anchors[i], frame_pose(kinematics, self.frame_ids[i])
-            b[i] = self._gains[i] * [*(position - x), *rotation_vector((rotation @ R.T).tolist())]
-            self.jacobians[i] = kinematics.frame_jacobian(self.frame_ids[i])
-        rows, missing = self._rows[active], b[active]
-        missing = missing[rows]
-        missing *= min(1.0, _CORRECTION / max(float(np.abs(missing).max(initial=0.0)), 1e-12))
-        return self.jacobians[active][rows], missing
-
-    def row_owners(self) -> IntArray:
-        """Return the contact of each of these rows, by number (c,)."""
-        active = self.active
-        return np.repeat(active, self._rows[active].sum(axis=1))
+        ids = np.array(self.frame_ids, dtype=np.intp)
+        J, b, _ = kernels.contact_rows(
+            kinematics.J, self.columns, self.support, kinematics.frame_poses, ids, self.anchors, self.gains,
+            self.surfaces, self.shares, self.jacobians,
+        )  # fmt: skip
+        return solve_contacts(J, b)
 
 
 def build_contacts(
@@ -145,7 +134,7 @@ def build_contacts(
     ids = [robot.frame_id(c.frame, f"{source}: contacts.{index}.frame") for index, c in enumerate(configs)]
     kinematics = ForwardKinematics(robot.model, ids)
     kinematics.compute(q0)
-    rows = ContactRows(configs, ids, kinematics)
+    rows = ContactRows(configs, ids, robot.model, kinematics)
     if not rows.update(kinematics).Z.shape[1]:
         raise ConfigError(f"{source}: contacts leave {robot.name} no way to move; leave some out, or make them points")
     return rows

@@ -15,7 +15,6 @@ from qpavoid.control.observer import MomentumObserver
 from qpavoid.dynamics import StepDynamics, mirrored
 from qpavoid.errors import ConfigError, require_known
 from qpavoid.kernels.layout import RowLayout
-from qpavoid.model.kinematics import ForwardKinematics
 from qpavoid.model.limits import JointBounds
 from qpavoid.model.robot import Robot
 from qpavoid.problem import Array, Contacts, IntArray, Mask, Problem, Solution
@@ -31,7 +30,12 @@ _EXCESS = 1e-9
 _IDENTITY = 1e-9
 """Residual of M a + h - rnea, over the size of the latter, that is round-off [-]."""
 
-
+_INSTEAD = {
+    "latency": "leave it out; of motors that are T late, more than 2 ms, give `tracking_rate` and `row_rate` at most "
+    "1 / (5 T)",
+    "planning": "leave it out; `plan_to` gives a path whose points can be the targets of steps",
+}
+"""What to do in place of what does not go together with torques yet."""
 Reasons = tuple[Reason, ...]
 
 
@@ -42,7 +46,6 @@ class RobotDynamics:
     """`DynamicsArrays` in compiled code, once `lay_out` was called."""
     contacts: ContactRows | None = None
     """Frames that rest, of a base that floats."""
-    _mirrors = True
 
     def __init__(
         self, robot: Robot, settings: config.Dynamics, bounds: JointBounds, dt: float, row_gain: float
@@ -124,7 +127,7 @@ class RobotDynamics:
             braking=self.bounds.acceleration,
             rows=np.zeros((count + len(x.rhs), n)), rhs=np.zeros(count + len(x.rhs)),
             torque=np.zeros(a), change=np.zeros(n), factor=np.zeros((n, n)), approaches=self.approaches,
-            has_torques=self.has_torques, mirrors=self._mirrors, has_holding=has_holding,
+            has_torques=self.has_torques, has_holding=has_holding,
             braking_fraction=settings.braking_fraction, holding_fraction=settings.holding_fraction or 0.0,
             tracking_factor=min(1.0, settings.tracking_rate * self._dt),
             row_factor=min(1.0, settings.row_rate * self._dt),
@@ -157,13 +160,14 @@ class RobotDynamics:
             self._gravity_slope[:] = pin.computeGeneralizedGravityDerivatives(model, data, q)
             self._gravity[:] = data.g
 
+    @property
+    def resting(self) -> Contacts | None:
+        """Contacts of the last step, at rest; None of a fixed base."""
+        return None
+
     def solve(self, solver: Solver, problem: Problem) -> Solution:
         """Return the solution of a law."""
         return solver.solve(problem)
-
-    def stand(self, kinematics: ForwardKinematics, v: Array) -> Contacts:
-        """Take up contacts, see `StandingDynamics`; a fixed base has none."""
-        raise NotImplementedError
 
     def observe(self, q: Array, v: Array) -> None:
         """Let the observer see a measured state of a step, after the torques of the step before."""
@@ -245,7 +249,7 @@ def make_dynamics(
         return None, bounds
     for name, given in others.items():
         if given:
-            raise ConfigError(f"dynamics: not together with `{name}` for now; leave one of them out")
+            raise ConfigError(f"dynamics: not together with `{name}`, which knows velocities alone: {_INSTEAD[name]}")
     arguments = robot, settings, bounds, dt, avoidance.row.gain
     if contacts is None:
         dynamics = RobotDynamics(*arguments)

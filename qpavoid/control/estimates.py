@@ -11,6 +11,7 @@ from qpavoid.kernels import Pieces
 from qpavoid.kernels.estimates import QUATERNION
 from qpavoid.kernels.obstacles import FARTHEST, FASTEST
 from qpavoid.kernels.pose_fit import FIT
+from qpavoid.kernels.turns import TURN_FIT
 from qpavoid.model.sample import POSE, STATE, Sample
 from qpavoid.problem import Array, IntArray
 
@@ -45,7 +46,10 @@ class MeasuredStates:
             stamps=np.full(count, nan),
             last=np.zeros((count, STATE)),
             at_rest=np.zeros(count, dtype=bool),
+            means=np.zeros((count, 6)),
             twists=np.zeros((count, 6)),
+            turns=np.zeros((count, 3)),
+            turn_fits=np.zeros((count, TURN_FIT)),
             counts=np.zeros(count),
             fits=np.zeros((count, FIT)),
             displacement=np.zeros(6),
@@ -73,7 +77,8 @@ class MeasuredStates:
         x = self.arrays
         self.known.pop(index, None)
         x.stamps[index], x.at_rest[index] = nan, False
-        x.counts[index], x.twists[index], x.fits[index] = 0.0, 0.0, 0.0
+        for memory in (x.counts, x.fits, x.means, x.twists, x.turns, x.turn_fits):
+            memory[index] = 0.0
 
     def begin(self, index: int, t: float, sample: Sample) -> None:
         """Take a sample as what is known of obstacle number `index` at t [s]."""

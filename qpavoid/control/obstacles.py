@@ -100,20 +100,27 @@ class ObstacleTracker:
         """What is known of the obstacles in the last step, as far as the future follows from it; nothing changes it."""
         if self._prediction is None:
             now, external = self.current, self.external
-            twists = self.mean_twists.copy() if len(external) else self.mean_twists
+            twists, turns = self.twists, self.turns
+            if len(external):
+                twists, turns = twists.copy(), turns.copy()
             states, margin = now.states.copy(), now.margin.copy()
             self._prediction = Prediction(
-                self._trajectories.pieces, now.which, states, margin, external, twists, self._now
+                self._trajectories.pieces, now.which, states, margin, external, twists, turns, self._now
             )
         return self._prediction
 
     @property
-    def mean_twists(self) -> Array:
-        """(o, 6) mean twists of external obstacles, with which they are predicted; zero of all others."""
+    def twists(self) -> Array:
+        """(o, 6) twists with which external obstacles are predicted; zero of all others."""
         return self._measured.arrays.twists
 
+    @property
+    def turns(self) -> Array:
+        """(o, 3) rates at which their linear velocities turn [rad/s]."""
+        return self._measured.arrays.turns
+
     def at(self, t: float, prediction: Prediction | None = None) -> ObstacleStates:
-        """Return the states at t [s]: on trajectories, or at constant mean twists; of the last step, as observed.
+        """Return the states at t [s]: on trajectories, or on lines and arcs; of the last step, as observed.
 
         Those of the last step are overwritten by the next one.
 

@@ -7,6 +7,9 @@ all bounded laws that hold contacts, their relaxation and their priorities are u
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Any
+
 import numpy as np
 import pinocchio as pin
 
@@ -17,7 +20,6 @@ from qpavoid.dynamics import StepDynamics, mirrored
 from qpavoid.errors import ConfigError
 from qpavoid.kernels.contact_forces import BASE
 from qpavoid.kernels.layout import RowLayout
-from qpavoid.model.kinematics import ForwardKinematics
 from qpavoid.model.limits import JointBounds
 from qpavoid.model.robot import Robot
 from qpavoid.problem import Array, Contacts, IntArray, Problem, Solution, Status
@@ -39,8 +41,6 @@ _LARGEST_ACCELERATION = 20.0
 class StandingDynamics(RobotDynamics):
     """Dynamics of a robot whose base floats, on its contacts."""
 
-    _mirrors = False
-
     def __init__(
         self, robot: Robot, settings: config.Dynamics, bounds: JointBounds, dt: float, row_gain: float,
         contacts: ContactRows,
@@ -61,7 +61,7 @@ class StandingDynamics(RobotDynamics):
         n = robot.model.nv
         self.contacts = self._contacts = contacts.own_copy()
         self._full, self._bias = np.zeros((n, n)), np.zeros(n)
-        self._x: RowLayout | None = None
+        self._margin, self._center, self._center_jacobian = settings.support_margin, np.zeros(3), np.zeros((3, n))
         self._lay_points()
         if settings.observer is not None:
             raise ConfigError(
@@ -69,9 +69,8 @@ class StandingDynamics(RobotDynamics):
             )
         super().__init__(robot, settings.model_copy(update={"holding_fraction": None}), bounds, dt, row_gain)
         self._M[:] = np.eye(n)
-        self._solved: tuple[Array, Array] | None = None
-        self._is_held = False
-        self._weight = 9.81 * float(pin.computeTotalMass(robot.model))
+        self._is_answered = self._is_settled = False
+        self._weight = np.array([9.81 * float(pin.computeTotalMass(robot.model))])
         self._names = tuple(robot.coordinate_names)
 
     def _lay_points(self) -> None:
@@ -104,7 +103,7 @@ class StandingDynamics(RobotDynamics):
         """Return the accelerations (nv,) that braking counts on at the most; see `RobotDynamics`."""
         references = self._acceleration.copy()
         self.update(q, np.zeros(self._model.nv))
-        own = 0.5 * self.limit / np.abs(self._full[BASE:]).sum(axis=1)
+        own = 0.5 * self.limit / np.abs(mirrored(self._full)[BASE:]).sum(axis=1)
         own = np.asarray(np.minimum(own, _LARGEST_ACCELERATION))
         references[BASE:] = np.where(np.isfinite(references[BASE:]), references[BASE:], own)
         references[:BASE] = np.where(np.isfinite(references[:BASE]), references[:BASE], _BASE_ACCELERATION)
@@ -116,86 +115,72 @@ class StandingDynamics(RobotDynamics):
     def lay_out(self, x: RowLayout) -> None:
         """See `RobotDynamics.lay_out`."""
         super().lay_out(x)
-        self._x = x
+        self._x, contacts, settings = x, self._contacts, self._contacts.settings
+        normals = np.array([contact.normal for contact in settings])
+        self._z = kernels.StandingArrays(
+            mass=self._full, bias=self._bias, frame_ids=np.array(contacts.frame_ids, dtype=np.intp),
+            support=contacts.support, anchors=contacts.anchors, gains=contacts.gains, surfaces=contacts.surfaces,
+            shares=contacts.shares, steps=np.array([min(1.0, self._dt * contact.rate) for contact in settings]),
+            normals=normals / np.linalg.norm(normals, axis=1, keepdims=True),
+            friction=np.array([contact.friction for contact in settings]),
+            force=np.array([contact.force for contact in settings]), points=self._points, owners=self._owners,
+            weight=self._weight, center=self._center, center_jacobian=self._center_jacobian,
+            jacobians=contacts.jacobians, leaves=contacts.leaves,
+            support_margin=-1.0 if self._margin is None else self._margin,
+            solved=np.full(len(x.v_prev) + self._points.size, np.nan), scale=_SCALE,
+        )  # fmt: skip
+        self._packed_z = kernels.pack(self._z)
+
+    def step(self, packed: Any, *arguments: Any) -> Callable[..., int]:
+        """See `RobotDynamics.step`."""
+        y, z = self.packed, self._packed_z
+        code = kernels.direct(kernels.standing_step, packed, y, z, *arguments[:-1])
+
+        def step(x: Any, q: Array, influence_distance: float, moving: bool, from_tasks: bool, measured: bool) -> int:
+            outcome, self._stance = code(x, y, z, q, influence_distance, moving, from_tasks)
+            self._is_answered = self._is_settled = outcome == kernels.SETTLED
+            return int(outcome)
+
+        return step
 
     def update(self, q: Array, v: Array) -> None:
         """Compute mass matrix and bias torques at q (nq,) and v (nv,)."""
-        self._full[:] = mirrored(pin.crba(self._model, self._data, q))
+        self._full[:] = pin.crba(self._model, self._data, q)
         self._bias[:] = pin.nonLinearEffects(self._model, self._data, q, v)
+        if self._margin is not None:
+            self._center_jacobian[:] = pin.jacobianCenterOfMass(self._model, self._data, q)
+            self._center[:] = self._data.com[0]
 
-    def stand(self, kinematics: ForwardKinematics, v: Array) -> Contacts:
-        """Take up contacts and base, for a step from the velocity v (nv,); return the contacts, at rest.
+    @property
+    def resting(self) -> Contacts:
+        """Contacts of the last step, at rest; a step approaches them at their rates, J v = (1 - κ_c) J v̄ + κ_c b."""
+        stance = self._stance
+        return Contacts(stance.Z, stance.resting, stance.J, stance.b)
 
-        A step approaches them at their rates: J v = (1 - κ_c) J v̄ + κ_c b.
+    @property
+    def _approached(self) -> Contacts:
+        """Contacts of the last step, as far as it approaches them."""
+        stance = self._stance
+        return Contacts(stance.Z, stance.approached, stance.J, stance.b_approached)
 
-        Args:
-            kinematics: those of the step; `update` was called for it.
-            v: as measured.
-        """
-        contacts, dt = self._contacts, self._dt
-        J, b = contacts.rows(kinematics)
-        resting = Contacts(*kernels.solve_rows(J, b), J, b)
-        rates = np.array([min(1.0, dt * contact.rate) for contact in contacts.settings]) * contacts.shares
-        Z, rest, b = resting.Z, resting.v_particular, J @ v + rates[contacts.row_owners()] * (b - J @ v)
-        if len(set(rates[contacts.active])) == 1:
-            rest = v - Z @ (Z.T @ v) + rates[contacts.active[0]] * (rest - v + Z @ (Z.T @ v))
-        else:
-            _, rest = kernels.solve_rows(J, b)
-        used = np.flatnonzero(np.isin(self._owners, contacts.active))
-        owners, n, m = self._owners[used], len(v), 3 * len(used)
-        rotations = np.array([kinematics.frame_poses[i, :9].reshape(3, 3).T for i in contacts.frame_ids])
-        offsets = np.einsum("kij,kj->ki", rotations[owners], self._points[used])
-        Jp, k = np.empty((m, n)), Z.shape[1]
-        kernels.point_jacobians(contacts.jacobians, offsets, owners, Jp)
-        X, start = np.empty((n + m, max(k + m - BASE, 0))), np.empty(n + m)
-        Y, N = np.empty((m, BASE)), np.empty((m, max(m - BASE, 0)))
-        self._is_held = bool(kernels.eliminate_base(self._full, self._bias, v, dt, Jp, Z, rest, _SCALE, X, start, Y, N))
-        self._v, self._used, self._solved = v.copy(), owners, None
-        self._approached, self._Jp, self._N, self._Y = Contacts(Z, rest, J, b), Jp, N, Y
-        if not self._is_held:
-            self._M[:], self._h[:] = 0.0, 0.0
-            self._M[BASE:], self._h[BASE:] = self._full[BASE:], self._bias[BASE:]
-            return resting
-        kernels.standing_dynamics(self._full, self._bias, Jp, Y, Z, self._M, self._h)
-        self._contact_set = self._with_base(X, start, J, b)
-        normals = np.array([contact.normal for contact in contacts.settings])
-        normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-        self._normals = np.einsum("kij,kj->ki", rotations[owners], normals[owners])
-        self._hard = self._hard_rows(owners, n, m)
-        return resting
-
-    def _with_base(self, X: Array, start: Array, J: Array, b: Array) -> Contacts:
+    def _contact_set(self, v_measured: Array) -> Contacts:
         """Return contacts and equations of the base as contacts of x = (v, s p)."""
-        n, m, c = len(self._v), len(self._Jp), len(b)
+        stance, M = self._stance, self._full[:BASE]
+        n, m, c = len(self._bias), len(stance.Jp), len(stance.b)
         rows, right = np.zeros((c + BASE, n + m)), np.empty(c + BASE)
-        rows[:c, :n], right[:c] = J, b
-        rows[c:, :n], rows[c:, n:] = self._full[:BASE], -self._Jp[:, :BASE].T / _SCALE
-        right[c:] = self._full[:BASE] @ self._v - self._dt * self._bias[:BASE]
-        return Contacts(X, start, rows, right)
+        rows[:c, :n], right[:c] = stance.J, stance.b_approached
+        rows[c:, :n], rows[c:, n:] = M, -stance.Jp[:, :BASE].T / _SCALE
+        right[c:] = M @ v_measured - self._dt * self._bias[:BASE]
+        return Contacts(stance.X, stance.start, rows, right)
 
-    def _hard_rows(self, owners: IntArray, n: int, m: int) -> StepDynamics:
+    def _hard_rows(self, v_measured: Array) -> StepDynamics:
         """Return the dynamics of x = (v, s p), with the rows of torque limits and cones."""
-        settings, shares = self._contacts.settings, self._contacts.shares[owners]
-        has_limits = bool(np.isfinite(self.limit).all())
-        torques, cones = 2 * len(self.limit) if has_limits else 0, kernels.ROWS_PER_POINT * len(owners)
-        rows, rhs = np.empty((torques + cones, n + m)), np.empty(torques + cones)
-        if has_limits:
-            kernels.force_torque_rows(
-                self._full, self._bias, self._v, self._dt, self._Jp, self.limit, _SCALE, rows[:torques], rhs[:torques]
-            )
-        friction, force = (
-            np.array([c.friction for c in settings])[owners],
-            np.array([c.force for c in settings])[owners],
-        )
-        kernels.cone_rows(
-            self._normals, friction, force[:, 0] * (shares == 1.0), force[:, 1] * shares, self._dt, _SCALE, n,
-            rows[torques:], rhs[torques:],
-        )  # fmt: skip
-        M = np.hstack((self._full, -self._Jp.T / _SCALE))
-        v = np.concatenate((self._v, np.zeros(m)))
-        points = tuple(settings[i].frame for i in owners)
+        stance, m = self._stance, len(self._stance.Jp)
+        M = np.hstack((self._full, -stance.Jp.T / _SCALE))
+        v = np.concatenate((v_measured, np.zeros(m)))
+        points = tuple(self._contacts.settings[i].frame for i in self._owners[stance.used])
         return StepDynamics(
-            M, self._bias, v, self._dt, self.actuated, self.limit, rows, rhs, torques + cones, points
+            M, self._bias, v, self._dt, self.actuated, self.limit, stance.rows, stance.rhs, stance.hard, points
         )  # fmt: skip
 
     def rows(self, v_measured: Array) -> StepDynamics | None:
@@ -210,27 +195,47 @@ class StandingDynamics(RobotDynamics):
         return np.asarray(self._approached.project(approached))
 
     def _with_impulses(self, v: Array) -> Array:
-        """Return x = (v, s p) of a velocity (nv,) that meets the contacts: with the p nearest to equal shares."""
-        needed = self._full[:BASE] @ (v - self._v) + self._dt * self._bias[:BASE]
-        equal = (self._dt * self._weight / len(self._used) * self._normals).ravel()
-        return np.concatenate((v, _SCALE * (self._Y @ needed + self._N @ (self._N.T @ equal))))
+        """Return x = (v, s p) of a velocity (nv,) that meets the contacts, see `kernels.with_impulses`."""
+        return np.asarray(kernels.with_impulses(self._packed_z, self._stance, self._x.v_prev, self._dt, v))
 
     def solve(self, solver: Solver, problem: Problem) -> Solution:
-        """Return the solution of a law, of the problem in x = (v, s p)."""
-        if not self._is_held or not np.isfinite(problem.v_tracking).all():
+        """Return the solution of a law, of the problem in x = (v, s p); of one that holds no contacts, in v.
+
+        Of the latter, Jacobians are those of motions that move no contact; `command` then finds the nearest velocity
+        that torques and cones allow.
+        """
+        if not self._stance.is_held or not np.isfinite(problem.v_tracking).all():
             return Solution(problem.v_stop.copy(), Status.STOPPED, (_not_held(),))
-        n, m = len(self._v), len(self._Jp)
+        if not solver.holds_contacts:
+            return solver.solve(self._supported(problem))
+        n, m = len(self._bias), len(self._stance.Jp)
         solution = solver.solve(self._full_problem(problem))
         if solution.v.shape == (n + m,):
-            self._solved = solution.v[:n].copy(), solution.v[n:] / _SCALE
-            solution = solution._replace(v=self._solved[0].copy())
+            self._take(solution.v)
+            solution = solution._replace(v=solution.v[:n].copy())
         if solution.status is Status.STOPPED:
-            self._solved = None
+            self._is_answered = False
         return solution
+
+    def _take(self, x: Array) -> None:
+        """Take x = (v, s p) as the answer of this step, with its impulses."""
+        n = len(self._bias)
+        self._z.solved[:n], self._z.solved[n : len(x)] = x[:n], x[n:] / _SCALE
+        self._is_answered, self._is_settled = True, False
+
+    def _supported(self, problem: Problem) -> Problem:
+        """Return a problem for a law that holds no contacts: its Jacobians are those of motions that move none."""
+        Z = self._approached.Z
+        A, J = (rows @ Z @ Z.T for rows in (problem.tracking.A, problem.avoidance.J))
+        return problem._replace(
+            tracking=problem.tracking._replace(A=A),
+            avoidance=problem.avoidance._replace(J=np.ascontiguousarray(J)),
+        )
 
     def _full_problem(self, problem: Problem) -> Problem:
         """Return a problem in v as one in x = (v, s p)."""
-        m, far = len(self._Jp), np.full(len(self._Jp), np.inf)
+        m, v_measured = len(self._stance.Jp), self._x.v_prev
+        far = np.full(m, np.inf)
 
         def padded(J: Array) -> Array:
             return np.hstack((J, np.zeros((len(J), m))))
@@ -247,7 +252,8 @@ class StandingDynamics(RobotDynamics):
             hard_upper=upper if is_hard else np.concatenate((problem.hard_upper, far)),
             v_stop=np.concatenate((problem.v_stop, np.zeros(m))),
             joint_names=(*self._names, *["impulse"] * m), joint_units=(*problem.joint_units, *["N s"] * m),
-            v_tracking=tracked, contacts=self._contact_set, dynamics=self._hard, tracking_is_clear=False,
+            v_tracking=tracked, contacts=self._contact_set(v_measured), dynamics=self._hard_rows(v_measured),
+            tracking_is_clear=False,
             cascade=None if cascade is None else np.array([self._with_impulses(v) for v in cascade]),
         )  # fmt: skip
         return full._replace(violation=float(kernels.violation(tracked, *full.inequalities, lower, upper)))
@@ -258,7 +264,7 @@ class StandingDynamics(RobotDynamics):
         """Return the solution with acceleration, torques and forces.
 
         A velocity that is not the law's, as of a stop, is replaced by the nearest one that torques and cones allow.
-        Where there is none, the joints brake as their torques allow, with gravity held, and the step is a stop.
+        Where there is none, the joints brake as their torques allow, with gravity stance, and the step is a stop.
 
         Args:
             solution: what is decided.
@@ -266,40 +272,41 @@ class StandingDynamics(RobotDynamics):
             names: of all nv coordinates.
             units: their units, rad or m.
         """
-        answer = self._solved
-        if answer is None or not np.array_equal(answer[0], solution.v):
-            answer = self._nearest(solution.v)
-        if answer is None:
+        n, m, y, z = len(self._bias), len(self._stance.Jp), self._arrays, self._z
+        if not (self._is_answered and np.array_equal(z.solved[:n], solution.v)) and not self._nearest(solution.v):
             return self._limp(solution)
-        v, p = answer
-        change = (v - v_measured) / self._dt
-        torque = (self._full[BASE:] @ change + self._bias[BASE:]) - self._Jp[:, BASE:].T @ p / self._dt
-        forces, settings = p.reshape(-1, 3) / self._dt, self._contacts.settings
-        by_frame = {settings[i].frame: forces[self._used == i] for i in np.unique(self._used).tolist()}
-        torque = np.clip(torque, -self.limit, self.limit)
-        return solution._replace(v=v, torque=torque, acceleration=change, forces=by_frame)
+        if not self._is_settled:
+            kernels.standing_torques(self.packed, self._packed_z, self._stance, v_measured, self._dt)
+        forces, owners = z.solved[n : n + m].reshape(-1, 3) / self._dt, self._owners[self._stance.used]
+        by_frame = {
+            contact.frame: forces[owners == i]
+            for i, contact in enumerate(self._contacts.settings)
+            if self._contacts.shares[i] > 0.0
+        }
+        return solution._replace(
+            v=z.solved[:n].copy(), torque=y.torque.copy(), acceleration=y.change.copy(), forces=by_frame
+        )
 
-    def _nearest(self, v: Array) -> tuple[Array, Array] | None:
-        """Return the velocity (nv,) nearest to another one that torques and cones allow, and its impulses, if any."""
-        if not self._is_held:
-            return None
-        n, hard, (X, start, *_) = len(v), self._hard, self._contact_set
+    def _nearest(self, v: Array) -> bool:
+        """Take the velocity nearest to v (nv,) that torques and cones allow; return whether there is one."""
+        if not (stance := self._stance).is_held:
+            return False
+        n, X, start = len(v), stance.X, stance.start
         target = X.T @ (self._with_impulses(self._approached.project(v)) - start)
         free = np.full(X.shape[1], np.inf)
-        J, b = np.ascontiguousarray(hard.J @ X), hard.b - hard.J @ start
+        rows, rhs = stance.rows[: stance.hard], stance.rhs[: stance.hard]
+        J, b = np.ascontiguousarray(rows @ X), rhs - rows @ start
         y, is_solved = kernels.project(
             np.ascontiguousarray(X[:n]), _VELOCITY_WEIGHT, target, J, b, -free, free
         )  # fmt: skip
-        if not is_solved:
-            return None
-        x = start + X @ y
-        return x[:n], x[n:] / _SCALE
+        if is_solved:
+            self._take(start + X @ y)
+        return bool(is_solved)
 
     def _limp(self, solution: Solution) -> Solution:
         """Return a stop by torques alone: those that hold gravity, and brake as far as limits allow."""
-        assert self._x is not None
         v = self._x.v_stop.copy()
-        change = (v - self._v) / self._dt
+        change = (v - self._x.v_prev) / self._dt
         torque = np.clip(self._M[BASE:] @ change + self._h[BASE:], -self.limit, self.limit)
         reasons = solution.reasons if _not_held().key in {reason.key for reason in solution.reasons} else (
             *solution.reasons, _not_held()

@@ -49,6 +49,8 @@ class TargetReader:
         self.last: Sequence[Any] = ()
         """Targets of all tasks in the step before; none before the first one."""
         self._is_written = False  # whether the frames are the poses of motions that never change
+        self._all_samples = np.arange(len(frames)), np.full(len(frames), SAMPLE)
+        self._check = kernels.direct(kernels.check_states, frames.copy(), *self._all_samples, FARTHEST, FASTEST)
         self.read(0.0, None)
         self._takes_samples = not latency and len(tasks) == len(frames)
         """Whether there are only frames, whose samples count as they are given."""
@@ -92,9 +94,7 @@ class TargetReader:
 
     def _are_fine(self) -> bool:
         """Return whether the states of the frame tasks can be true, and need not be normalised."""
-        count = len(self._frames)
-        numbers, kinds = np.arange(count), np.full(count, SAMPLE)
-        return not kernels.check_states(self._frames, numbers, kinds, FARTHEST, FASTEST)[0].any()
+        return not self._check(self._frames, *self._all_samples, FARTHEST, FASTEST)[0].any()
 
     def _placed(self, task: RowTask, value: Any) -> Any:
         """Return a target as it is, or the pose that it stands for, of a task whose target is somewhere.

@@ -18,14 +18,8 @@ from qpavoid.kernels.clearance import (
     joint_speeds,
     leaves_position_limits,
 )
-from qpavoid.kernels.contact_forces import (
-    ROWS_PER_POINT,
-    cone_rows,
-    eliminate_base,
-    force_torque_rows,
-    point_jacobians,
-    standing_dynamics,
-)
+from qpavoid.kernels.contact_forces import ROWS_PER_POINT
+from qpavoid.kernels.contact_rows import contact_rows
 from qpavoid.kernels.depth import CellGrid, OwnBodies, fill_cells, mark_own_pixels, recall_cells
 from qpavoid.kernels.dynamics import (
     DynamicsArrays,
@@ -52,6 +46,8 @@ from qpavoid.kernels.ramps import RampLimits, follow_ramp, velocity_towards
 from qpavoid.kernels.rollout import RolloutArrays, advance_rollout, begin_rollout, offset_of_start, rollout_outcome
 from qpavoid.kernels.rotation import rotation_vector
 from qpavoid.kernels.rows import alpha, beta, distance_rows, row_bounds
+from qpavoid.kernels.standing import standing_step, standing_torques, with_impulses
+from qpavoid.kernels.standing_layout import Stance, StandingArrays
 from qpavoid.kernels.step import (
     SETTLED,
     TO_MEASURE,
@@ -61,6 +57,7 @@ from qpavoid.kernels.step import (
     tracking_violation,
     violation,
 )
+from qpavoid.kernels.straying import any_displaced, any_moves, strays, surprise
 from qpavoid.kernels.structures import direct, pack
 from qpavoid.kernels.task_curvature import add_curvature
 from qpavoid.kernels.tasks import frame_rows, projection_cost
@@ -87,9 +84,13 @@ __all__ = [
     "RampLimits",
     "RolloutArrays",
     "RowLayout",
+    "Stance",
+    "StandingArrays",
     "add_curvature",
     "advance_rollout",
     "alpha",
+    "any_displaced",
+    "any_moves",
     "assemble",
     "backup_rows",
     "begin_rollout",
@@ -100,20 +101,18 @@ __all__ = [
     "clearance_lower_bound",
     "closes_below",
     "comes_near",
-    "cone_rows",
+    "contact_rows",
     "control_step",
     "direct",
     "distance_rows",
     "distances_of",
     "dynamics_step",
-    "eliminate_base",
     "extend_paths",
     "extrapolate_states",
     "fill_cells",
     "find_near_pairs",
     "first_use",
     "follow_ramp",
-    "force_torque_rows",
     "forward_dynamics",
     "frame_rows",
     "inverse_dynamics",
@@ -132,7 +131,6 @@ __all__ = [
     "pair_clearances",
     "place_bodies",
     "place_obstacles",
-    "point_jacobians",
     "predict",
     "prediction_error_bound",
     "project",
@@ -151,8 +149,11 @@ __all__ = [
     "solve_rows",
     "sorted_setxor",
     "speed_to_stop",
-    "standing_dynamics",
+    "standing_step",
+    "standing_torques",
     "stop_velocity",
+    "strays",
+    "surprise",
     "take_usual",
     "tracking_law",
     "tracking_violation",
@@ -161,5 +162,6 @@ __all__ = [
     "velocity_towards",
     "violation",
     "voxels_within",
+    "with_impulses",
     "write_path_point",
 ]

@@ -9,6 +9,7 @@ import numpy as np
 from qpavoid.kernels.obstacles import Pieces, sample_pieces
 from qpavoid.kernels.packing import compiled
 from qpavoid.kernels.rollout import HORIZON, PREFERRED_DISTANCE
+from qpavoid.kernels.turns import follow_arc
 from qpavoid.problem import Array, IntArray
 
 PATH_PERIOD = 0.1
@@ -31,7 +32,9 @@ class ApproachArrays(NamedTuple):
     states: Array
     """(o, 18) of the obstacles."""
     twists: Array
-    """(o, 6) velocities that external ones keep [m/s, rad/s]."""
+    """(o, 6) velocities of external ones [m/s, rad/s]."""
+    turns: Array
+    """(o, 3) rates at which the linear ones turn [rad/s]."""
     numbers: IntArray
     """(r,) number of each row, r = `PATH_POINTS`."""
     positions: Array
@@ -97,14 +100,14 @@ def extend_paths(x: Any, pieces: Pieces, on_paths: IntArray, first: int) -> None
 def comes_near(x: Any, distances: Any, v: Array, external: IntArray, on_paths: IntArray) -> tuple[bool, float]:
     """Find out whether a moving obstacle may come within the preferred distance until the horizon.
 
-    The robot moves at v once more, and brakes. External obstacles go on straight; between the positions on their paths,
-    others are no faster than at these.
+    The robot moves at v once more, and brakes. External obstacles go on along lines or arcs; between the positions on
+    their paths, others are no faster than at these.
 
     Args:
         x: see `ApproachArrays`.
         distances: of this step; reads joints and centers, see `DistanceArrays`.
         v: velocity (n,) [rad/s or m/s].
-        external: numbers of the obstacles that go on straight (k,).
+        external: numbers of the obstacles that go on along lines or arcs (k,).
         on_paths: numbers of those on paths (l,).
 
     Returns:
@@ -121,8 +124,14 @@ def comes_near(x: Any, distances: Any, v: Array, external: IntArray, on_paths: I
         if speed > 0.0 or turning > 0.0:
             fastest = max(fastest, speed + (turning * x.radii[i] if turning > 0.0 else 0.0))
             keep, p = x.radii[i] + x.margin[i] + distance, x.states[i, 9:12]
-            if not (near or _line_distance(p, u, speed, center) > keep + radius):
-                near = _passes(x, distances, p, u, speed, keep)
+            if near:
+                continue
+            if x.turns[i, 0] == 0.0 and x.turns[i, 1] == 0.0 and x.turns[i, 2] == 0.0:
+                near = not _line_distance(p, u, speed, center) > keep + radius and _passes(
+                    x, distances, p, u, speed, keep
+                )
+            elif not _distance(p, center) > keep + radius + speed * HORIZON:
+                near = _comes_round(x, distances, i, keep + 0.5 * PATH_PERIOD * speed, center, radius)
     for i in on_paths:
         if x.spans[i, 3] < 0.0:
             continue
@@ -136,6 +145,28 @@ def comes_near(x: Any, distances: Any, v: Array, external: IntArray, on_paths: I
             if not (near or _distance(p, center) > keep + radius):
                 near = _passes(x, distances, p, p, 0.0, keep)
     return near, fastest
+
+
+@compiled
+def _comes_round(x: Any, distances: Any, i: int, keep: float, center: Array, radius: float) -> bool:
+    """Return whether obstacle i comes within `keep` of a body at a time of its arc, these `PATH_PERIOD` apart.
+
+    Args:
+        x: see `ApproachArrays`; writes scratch.
+        distances: see `comes_near`.
+        i: number of the obstacle.
+        keep: distance [m].
+        center: of a ball around all bodies (3,) [m].
+        radius: of that [m].
+    """
+    state = x.scratch[i]
+    for s in range(PATH_POINTS - 1):
+        state[:12], state[12:] = x.states[i, :12], x.twists[i]
+        follow_arc(state, x.turns[i], s * PATH_PERIOD)
+        p = state[9:12]
+        if not _distance(p, center) > keep + radius and _passes(x, distances, p, p, 0.0, keep):
+            return True
+    return False
 
 
 @compiled

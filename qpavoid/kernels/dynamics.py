@@ -11,14 +11,21 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from qpavoid.kernels.bounds import OUTSIDE, velocity_bounds
+from qpavoid.kernels.bounds import velocity_bounds
 from qpavoid.kernels.cholesky import factorise, solve_factored
 from qpavoid.kernels.clearance import is_clear
-from qpavoid.kernels.dynamics_rows import admit_stop, holding_rows, scale_braking, slow_rows, torque_rows
+from qpavoid.kernels.dynamics_rows import admit_stop, approached_rows, holding_rows, scale_braking, torque_rows
 from qpavoid.kernels.packing import compiled
 from qpavoid.kernels.qp import project, project_soft
-from qpavoid.kernels.rows import distance_rows, row_bounds
-from qpavoid.kernels.step import SETTLED, TO_MEASURE, UNSETTLED, _is_too_near, find_near_pairs, violation
+from qpavoid.kernels.step import (
+    SETTLED,
+    TO_MEASURE,
+    TO_SOLVE,
+    UNSETTLED,
+    find_near_pairs,
+    settle_tracking,
+    violation,
+)
 from qpavoid.kernels.tasks import frame_rows
 from qpavoid.kernels.tracking_law import tracking_law
 from qpavoid.problem import Array, IntArray, Mask
@@ -62,8 +69,6 @@ class DynamicsArrays(NamedTuple):
     """(1,) whether v_tracking is approached at `tracking_factor`, or taken as it is."""
     has_torques: bool
     """Whether torques have limits."""
-    mirrors: bool
-    """Whether the lower triangle of M is that of the upper one; else rows of M are as they are."""
     has_holding: bool
     """Whether there are rows of holding."""
     braking_fraction: float
@@ -99,10 +104,9 @@ def dynamics_step(
         if meeting > 0:
             return TO_MEASURE
     s, n, m = x.summary[0], len(x.v_prev), len(y.rhs) - len(x.rhs)
-    if y.mirrors:
-        for i in range(n):
-            for j in range(i):
-                y.M[i, j] = y.M[j, i]
+    for i in range(n):
+        for j in range(i):
+            y.M[i, j] = y.M[j, i]
     scale_braking(x, y)
     margin, bent = velocity_bounds(x, q), 0.0
     admit_stop(x, y)
@@ -111,13 +115,7 @@ def dynamics_step(
         bent = tracking_law(x, x.A, x.b, x.v_tracking, x.b_feasible)
         if x.task_switching:
             bent = 0.0
-    k = distance_rows(x, x.distances.rows[: x.distances.counts[1]], influence_distance, moving)
-    stop = x.v_stop.copy()
-    if y.has_torques:  # rows ask for more than the straight stop gives, where they have to
-        x.v_stop[:] = 0.0
-    row_bounds(x, k, moving)
-    x.v_stop[:] = stop
-    slow_rows(x, y, k)
+    k = approached_rows(x, y, influence_distance, moving)
     if y.approaches[0]:
         for j in range(n):
             x.v_tracking[j] = x.v_prev[j] + y.tracking_factor * (x.v_tracking[j] - x.v_prev[j])
@@ -130,13 +128,9 @@ def dynamics_step(
     worst = violation(x.v_tracking, G, g, x.lower, x.upper)
     is_tracking_clear = x.looks_ahead and worst <= 0.0 and is_clear(x, q, x.v_tracking, k, influence_distance)
     s.rows, s.violation, s.is_clear, s.position_margin, s.bent = k, worst, is_tracking_clear, margin, bent
-    if x.regularization == 0.0 or not x.looks_ahead or margin < -OUTSIDE:
-        return UNSETTLED
-    if worst <= 0.0:
-        x.v[:] = x.v_tracking
-        return SETTLED if is_tracking_clear else UNSETTLED
-    if _is_too_near(x, k):
-        return UNSETTLED
+    code = settle_tracking(x, k)
+    if code != TO_SOLVE:
+        return code
     A, regularization = x.A if from_tasks else x.identity, max(x.regularization, bent)
     v, is_solved = project(A, regularization, x.v_tracking, G, g, x.lower, x.upper)
     if not is_solved:

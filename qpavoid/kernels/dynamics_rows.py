@@ -6,6 +6,7 @@ from typing import Any
 
 from qpavoid.kernels.braking_trajectory import stop_velocity
 from qpavoid.kernels.packing import compiled
+from qpavoid.kernels.rows import distance_rows, row_bounds
 
 LEAST_SCALE = 0.02
 """Least scale of the accelerations on which braking counts [-]: bounds need some."""
@@ -103,6 +104,26 @@ def admit_stop(x: Any, y: Any) -> None:
         x.v_stop[j] = (1.0 - factor) * v[j]
         if not y.has_torques:
             x.v_stop[j] = min(max(x.v_stop[j], x.lower[j]), x.upper[j])
+
+
+@compiled
+def approached_rows(x: Any, y: Any, influence_distance: float, moving: bool) -> int:
+    """Write the rows of the near pairs, approached at a finite rate; return their number.
+
+    Args:
+        x: memory of the step, with the distances of the near pairs.
+        y: reads has_torques and row_factor.
+        influence_distance: surface distance below which a pair is near [m].
+        moving: whether any obstacle moves.
+    """
+    k = distance_rows(x, x.distances.rows[: x.distances.counts[1]], influence_distance, moving)
+    stop = x.v_stop.copy()
+    if y.has_torques:  # rows ask for more than the straight stop gives, where they have to
+        x.v_stop[:] = 0.0
+    row_bounds(x, k, moving)
+    x.v_stop[:] = stop
+    slow_rows(x, y, k)
+    return k
 
 
 @compiled

@@ -23,6 +23,7 @@ from qpavoid.kernels.obstacles import (
 )
 from qpavoid.kernels.packing import compiled
 from qpavoid.kernels.pose_fit import extrapolate, fit_pose, start_fit
+from qpavoid.kernels.turns import fit_turn
 from qpavoid.problem import Array, IntArray, Mask
 
 MARGIN_GROWTH = 0.1
@@ -58,8 +59,14 @@ class ObstacleArrays(NamedTuple):
     """(o, 18) the last updates, at their time stamps."""
     at_rest: Mask
     """(o,) whether these were at rest."""
-    twists: Array
+    means: Array
     """(o, 6) means of their twists [m/s, rad/s]."""
+    twists: Array
+    """(o, 6) twists that they are predicted with: the means, or as far as they turn, those of the fit [m/s, rad/s]."""
+    turns: Array
+    """(o, 3) rates at which their linear velocities turn [rad/s]."""
+    turn_fits: Array
+    """(o, TURN_FIT) of their linear velocities, see `fit_turn`."""
     counts: Array
     """(o,) how many twists are in each mean."""
     fits: Array
@@ -160,7 +167,7 @@ def observe(x: Any, t: float, which: IntArray, kind: IntArray, times: Array, ext
 
 @compiled
 def _take_over(x: Any, i: int, kind: int, stamp: float) -> bool:
-    """Take over the update of obstacle i, and its twist into the mean of these; that of a bare pose from `fit_pose`.
+    """Take over the update of obstacle i, and its twist into mean and fit of these; that of a bare pose by `fit_pose`.
 
     A mean is of all twists at first, then of those within about `_STEADY`: m += λ (ν - m) with λ the larger of 1/n and
     T / (steady + T), T since the update before.
@@ -195,7 +202,12 @@ def _take_over(x: Any, i: int, kind: int, stamp: float) -> bool:
     gain = 1.0 / x.counts[i]
     if elapsed > 0.0:
         gain = max(gain, elapsed / (_STEADY + elapsed))
-    mean = x.twists[i]
+    mean, turning = x.means[i], x.turn_fits[i]
+    if not elapsed <= x.shortest:  # NaN, too
+        fit_turn(turning, new[12:15], elapsed, x.turns[i])
     for c in range(6):
         mean[c] += gain * (new[12 + c] - mean[c])
+        x.twists[i, c] = mean[c]
+    for c in range(3):
+        x.twists[i, c] += turning[9] * (turning[c] - mean[c])
     return True

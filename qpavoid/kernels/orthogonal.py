@@ -89,6 +89,13 @@ def solve_rows(J: Array, b: Array) -> tuple[Array, Array]:
     c, n = J.shape
     Q, R, order = np.empty((n, n)), np.empty((n, c)), np.empty(c, dtype=np.intp)
     rank = factorise_rows(J, Q, R, order)
+    return Q[:, rank:].copy(), least_solution(Q, R, order, rank, b)
+
+
+@compiled
+def least_solution(Q: Array, R: Array, order: IntArray, rank: int, b: Array) -> Array:
+    """Compute the least v (n,) with J v = b (c,), from the factors of J; see `factorise_rows`."""
+    n = len(Q)
     v, y = np.zeros(n), np.empty(rank)
     for i in range(rank):
         total = b[order[i]]
@@ -97,4 +104,4 @@ def solve_rows(J: Array, b: Array) -> tuple[Array, Array]:
         y[i] = total / R[i, i]
         for k in range(n):
             v[k] += Q[k, i] * y[i]
-    return Q[:, rank:].copy(), v
+    return v

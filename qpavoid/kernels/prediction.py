@@ -1,4 +1,4 @@
-"""Where obstacles will be: on their trajectories, or at constant mean twists; and how far that may be off.
+"""Where obstacles will be: on their trajectories, or at mean twists that turn as of late; and how far that may be off.
 
 A *state* of an obstacle is a row of 18, see `qpavoid.kernels.obstacles`.
 """
@@ -11,7 +11,7 @@ import numpy as np
 
 from qpavoid.kernels.obstacles import Pieces, sample_pieces
 from qpavoid.kernels.packing import compiled
-from qpavoid.kernels.pose_fit import extrapolate
+from qpavoid.kernels.turns import follow_arc
 from qpavoid.problem import Array, IntArray
 
 
@@ -30,6 +30,8 @@ class Prediction(NamedTuple):
     """(e,) numbers of those that a program gives."""
     twists: Array
     """(o, 6) mean twists of these [m/s, rad/s]."""
+    turns: Array
+    """(o, 3) rates at which their linear velocities turn [rad/s]."""
     t: float
     """That time [s]."""
 
@@ -49,15 +51,16 @@ def predict(x: Prediction, t: float, states: Array) -> None:
     sample_pieces(x.pieces, t, states)
     for i in x.external:
         states[i, :12], states[i, 12:] = x.states[i, :12], x.twists[i]
-        extrapolate(states[i], t - x.t)
+        follow_arc(states[i], x.turns[i], t - x.t)
 
 
 @compiled
 def prediction_error_bound(now: Prediction, earlier: Prediction, span: float, radii: Array) -> float:
     """Bound how far any point of an external obstacle is from an earlier prediction, now and for some time [m].
 
-    Positions and rotations that are off by δp and δR, and twists by δv and δω, leave a point that is r from the
-    origin no farther off than |δp| + t |δv| + r (‖δR‖ + t |δω|) after t.
+    Positions and rotations that are off by δp and δR, twists by δv and δω, and turns by δΩ, leave a point that is r
+    from the origin no farther off than |δp| + t |δv| + ½ t² |δΩ| |v| + r (‖δR‖ + t |δω|) after t: rotations by tΩ
+    differ by no more than t |δΩ|. The smaller |v| of the two counts.
 
     Args:
         now: what is known now.
@@ -76,14 +79,18 @@ def prediction_error_bound(now: Prediction, earlier: Prediction, span: float, ra
         if earlier.external[k] != i:
             return np.inf
         expected[:12], expected[12:] = earlier.states[i, :12], earlier.twists[i]
-        extrapolate(expected, now.t - earlier.t)
-        position, rotation, linear, angular = 0.0, 0.0, 0.0, 0.0
+        follow_arc(expected, earlier.turns[i], now.t - earlier.t)
+        position, rotation, linear, angular, turn, speed, speed_before = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
         for c in range(9):
             rotation += (now.states[i, c] - expected[c]) ** 2
         for c in range(3):
             position += (now.states[i, 9 + c] - expected[9 + c]) ** 2
             linear += (now.twists[i, c] - expected[12 + c]) ** 2
             angular += (now.twists[i, 3 + c] - expected[15 + c]) ** 2
+            turn += (now.turns[i, c] - earlier.turns[i, c]) ** 2
+            speed += now.twists[i, c] ** 2
+            speed_before += earlier.twists[i, c] ** 2
         bound, turned = np.sqrt(position) + span * np.sqrt(linear), np.sqrt(rotation) + span * np.sqrt(angular)
+        bound += 0.5 * span * span * np.sqrt(turn * min(speed, speed_before))
         worst = max(worst, bound + (radii[i] * turned if turned > 0.0 else 0.0))
     return worst

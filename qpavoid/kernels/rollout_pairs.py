@@ -34,13 +34,14 @@ class PairMemory(NamedTuple):
     travels: Array
     """(g,) bound on the path that any point of each body has travelled [m]."""
     computed: Array
-    """(m,) distance of each pair when it was computed [m]."""
+    """(m,) distance of each pair when it was computed, less its margin [m]."""
     limits: Array
     """(m,) the same plus the travels of its bodies until then, less which it bounds the distance; -∞ at first [m]."""
     bounds: Array
     """(m,) lower bound on the distance of each pair that was not computed at the last pose, infinite of others [m]."""
     points: Array
-    """(m, 6) witness points of each pair, each in the frame of its body [m]."""
+    """(m, 6) witness points of each pair, each in the frame of its body; the second is moved towards the first by the
+    margin, as if its body were so much larger [m]."""
     due: IntArray
     """(m,) the first entries: pairs that are computed at this pose."""
 
@@ -84,12 +85,12 @@ def near_pairs_along(
         a, b, bound = x.pairs[k, 0], x.pairs[k, 1], -np.inf
         if x.method[k] != TO_HALF_SPACE:  # whose travels may be endless
             bound = limits[k] - travels[a] - travels[b]
-        beyond = bound - x.margin[x.twist_row[k]]
-        if beyond >= influence_distance:
+        if bound >= influence_distance:
             continue
-        if beyond >= preferred_distance and p.computed[k] - bound <= _TRAVEL_FRACTION * p.computed[k]:
-            p.bounds[k] = bound
-            _follow_points(poses[a], poses[b], p.points[k], results[k])
+        if bound >= preferred_distance and p.computed[k] - bound <= _TRAVEL_FRACTION * p.computed[k]:
+            margin = x.margin[x.twist_row[k]]
+            p.bounds[k] = bound + margin
+            _follow_points(poses[a], poses[b], p.points[k], margin, results[k])
         else:
             p.bounds[k] = np.inf
             p.due[due] = k
@@ -125,17 +126,18 @@ def _add_travel(x: Any, p: PairMemory, g: int, is_first: bool) -> None:
 
 
 @inlined
-def _follow_points(one: Array, two: Array, points: Array, result: Array) -> None:
-    """Write the result of a pair from witness points fixed to its bodies, which are at the poses `one` and `two`."""
+def _follow_points(one: Array, two: Array, points: Array, margin: float, result: Array) -> None:
+    """Write the result of a pair from `points` fixed to its bodies, which are at the poses `one` and `two`."""
     square = 0.0
     for r in range(3):
         a = one[9 + r] + one[r] * points[0] + one[3 + r] * points[1] + one[6 + r] * points[2]
         b = two[9 + r] + two[r] * points[3] + two[3 + r] * points[4] + two[6 + r] * points[5]
         result[1 + r], result[4 + r], result[7 + r] = b - a, a, b
         square += (b - a) ** 2
-    result[0] = np.sqrt(square)
+    distance = np.sqrt(square)
     for c in range(3):
-        result[1 + c] /= result[0]
+        result[1 + c] /= distance
+    result[0] = distance + margin
 
 
 @inlined
@@ -144,9 +146,12 @@ def _remember(x: Any, p: PairMemory, k: int) -> None:
     a, b, result = x.pairs[k, 0], x.pairs[k, 1], x.results[k]
     if x.method[k] <= SPARE_BY_COAL:
         return
-    p.computed[k], p.limits[k] = result[0], result[0] + p.travels[a] + p.travels[b]
+    margin = x.margin[x.twist_row[k]]
+    p.computed[k] = result[0] - margin
+    p.limits[k] = p.computed[k] + p.travels[a] + p.travels[b]
     for c in range(3):
         p.points[k, c], p.points[k, 3 + c] = 0.0, 0.0
         for r in range(3):
             p.points[k, c] += x.poses[a, 3 * c + r] * (result[4 + r] - x.poses[a, 9 + r])
-            p.points[k, 3 + c] += x.poses[b, 3 * c + r] * (result[7 + r] - x.poses[b, 9 + r])
+            second = result[7 + r] - margin * result[1 + r]
+            p.points[k, 3 + c] += x.poses[b, 3 * c + r] * (second - x.poses[b, 9 + r])

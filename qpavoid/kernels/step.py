@@ -21,8 +21,8 @@ from qpavoid.problem import Array, IntArray
 TOLERATED_DEPTH = 1e-3
 """Depth below the safety distance [m], or excess over a position limit [rad or m], that slows nothing down: noise and
 control periods lead that far."""
-SETTLED, UNSETTLED, TO_MEASURE = range(3)
-"""What `control_step` returns."""
+SETTLED, UNSETTLED, TO_MEASURE, TO_SOLVE = range(4)
+"""What `control_step` returns, and TO_SOLVE where it solves its QP first."""
 
 
 @compiled
@@ -64,13 +64,9 @@ def control_step(x: Any, q: Array, influence_distance: float, moving: bool, from
     pairs, s = x.distances.rows[: x.distances.counts[1]], x.summary[0]
     k, worst, is_tracking_clear, margin, bent = assemble(x, q, pairs, influence_distance, moving, from_tasks)
     s.rows, s.violation, s.is_clear, s.position_margin, s.bent = k, worst, is_tracking_clear, margin, bent
-    if x.regularization == 0.0 or not x.looks_ahead or margin < -OUTSIDE:
-        return UNSETTLED
-    if worst <= 0.0:
-        x.v[:] = x.v_tracking
-        return SETTLED if is_tracking_clear else UNSETTLED
-    if _is_too_near(x, k):
-        return UNSETTLED
+    code = settle_tracking(x, k)
+    if code != TO_SOLVE:
+        return code
     A = x.A if from_tasks else x.identity
     v, is_solved = project(A, max(x.regularization, bent), x.v_tracking, x.J[:k], x.rhs[:k], x.lower, x.upper)
     x.v[:] = v
@@ -78,7 +74,24 @@ def control_step(x: Any, q: Array, influence_distance: float, moving: bool, from
 
 
 @compiled
-def _is_too_near(x: Any, k: int) -> bool:
+def settle_tracking(x: Any, k: int) -> int:
+    """Write v where the tracked velocity may be commanded; return whether it may, or what decides instead.
+
+    Args:
+        x: memory of a step, with its `SUMMARY`.
+        k: number of near pairs.
+    """
+    s = x.summary[0]
+    if x.regularization == 0.0 or not x.looks_ahead or s.position_margin < -OUTSIDE:
+        return UNSETTLED
+    if s.violation <= 0.0:
+        x.v[:] = x.v_tracking
+        return SETTLED if s.is_clear else UNSETTLED
+    return UNSETTLED if is_too_near(x, k) else TO_SOLVE
+
+
+@compiled
+def is_too_near(x: Any, k: int) -> bool:
     """Return True if any of the first k pairs is so near that the robot has to recover, or if that is unknown."""
     nearest = np.inf
     for i in range(k):

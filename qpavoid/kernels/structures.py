@@ -17,6 +17,7 @@ from qpavoid.kernels.near_pairs import DistanceArrays
 from qpavoid.kernels.packing import compiled
 from qpavoid.kernels.planning import PlanningArrays
 from qpavoid.kernels.rollout import RolloutArrays
+from qpavoid.kernels.standing_layout import StandingArrays
 
 
 class _Structure(types.StructRef):  # type: ignore[misc]
@@ -49,6 +50,15 @@ class PackedObstacles(structref.StructRefProxy):  # type: ignore[misc]
 
 class PackedDynamics(structref.StructRefProxy):  # type: ignore[misc]
     """`DynamicsArrays` in compiled code."""
+
+
+class PackedStanding(structref.StructRefProxy):  # type: ignore[misc]
+    """`StandingArrays` in compiled code."""
+
+
+@structref.register
+class PackedStandingType(_Structure):
+    """Type of `PackedStanding`."""
 
 
 @structref.register
@@ -108,6 +118,7 @@ for proxy, kind, fields in (
     (PackedPlanning, PackedPlanningType, PlanningArrays._fields),
     (PackedObstacles, PackedObstaclesType, ObstacleArrays._fields),
     (PackedDynamics, PackedDynamicsType, DynamicsArrays._fields),
+    (PackedStanding, PackedStandingType, StandingArrays._fields),
 ):
     structref.define_boxing(kind, proxy)
     structref.define_constructor(proxy, kind, list(fields))
@@ -161,6 +172,12 @@ def _pack_dynamics(fields: Any) -> Any:
     return PackedDynamics(*fields)
 
 
+@compiled
+def _pack_standing(fields: Any) -> Any:
+    """Return a structure of the fields of `StandingArrays`."""
+    return PackedStanding(*fields)
+
+
 _PACK = {
     KinematicsArrays: _pack_kinematics,
     DistanceArrays: _pack_distances,
@@ -170,6 +187,7 @@ _PACK = {
     PlanningArrays: _pack_planning,
     ObstacleArrays: _pack_obstacles,
     DynamicsArrays: _pack_dynamics,
+    StandingArrays: _pack_standing,
 }
 
 
@@ -181,7 +199,8 @@ def pack(
     | ApproachArrays
     | ObstacleArrays
     | PlanningArrays
-    | DynamicsArrays,
+    | DynamicsArrays
+    | StandingArrays,
 ) -> Any:
     """Return memory in the form that the kernels take; both look into the same arrays.
 

@@ -113,25 +113,14 @@ class ForwardKinematics:
         x = self.frame_poses[frame_id, 9:]
         return np.asarray(np.concatenate((linear - pin.skew(x) @ angular, angular)) @ self._fold)
 
-    @cached_property
-    def _masses(self) -> tuple[Array, Array]:
-        """(njoints,) masses, 0 of what never moves, and (njoints, 3) their centres in their joints [kg, m]."""
-        inertias = list(self._model.inertias)
-        masses = np.array([body.mass for body in inertias])
-        masses[0] = 0.0
-        return masses, np.array([body.lever for body in inertias])
+    def center_of_mass(self, q: Array) -> tuple[Array, Array]:
+        """Return the centre of mass (3,) at q (nq,), world [m], and its Jacobian (3, nv)."""
+        J = pin.jacobianCenterOfMass(self._model, self._data, q)
+        return np.array(self._data.com[0]), np.asarray(J)
 
-    def center_of_mass(self) -> tuple[Array, Array]:
-        """Return the centre of mass (3,), world [m], and its Jacobian (3, nv).
-
-        Of each column, with the twist [v; ω] at the world's origin, the bodies that it moves count with v + ω × c.
-        """
-        masses, levers = self._masses
-        rotations = self.joint_poses[:, :9].reshape(-1, 3, 3)  # transposed
-        moments = masses[:, None] * (self.joint_poses[:, 9:] + np.einsum("jki,jk->ji", rotations, levers))
-        moved, total = moments.T @ self._support, masses.sum()
-        J = self.J[:3] * (masses @ self._support) + np.cross(self.J[3:], moved, axis=0)
-        return moments.sum(axis=0) / total, J @ self._fold / total
+    def momentum_matrix(self, q: Array) -> Array:
+        """Return A_g (6, nv) at q (nq,): A_g v is momentum, then angular momentum about the centre of mass, world."""
+        return np.asarray(pin.computeCentroidalMap(self._model, self._data, q))
 
     def _lay_out(self, kinds: Sequence[int]) -> kernels.KinematicsArrays:
         model, data, joints = self._model, self._data, list(self._model.joints)

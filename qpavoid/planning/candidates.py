@@ -13,7 +13,7 @@ import numpy as np
 
 from qpavoid.config import Planning
 from qpavoid.planning.drive import TRACK, Drive, Mode
-from qpavoid.planning.forecast import Forecast, Forecaster, Snapshot
+from qpavoid.planning.forecast import Expected, Forecast, Forecaster, Snapshot
 from qpavoid.planning.path import Path
 from qpavoid.planning.planner import Planner
 from qpavoid.problem import Array
@@ -48,7 +48,7 @@ class Decision(NamedTuple):
     t: float
     """[s]."""
     drive: Drive
-    forecast: Forecast
+    expected: Expected
     """What it leads to."""
 
 
@@ -57,7 +57,7 @@ class Outcome(NamedTuple):
 
     arrives: bool
     """Whether the present drive does."""
-    forecast: Forecast
+    expected: Expected
     """What the present drive leads to."""
     decision: Decision | None = None
     """Another drive, if one is better."""
@@ -66,7 +66,7 @@ class Outcome(NamedTuple):
 def is_sound(outcome: Outcome, model: Any) -> bool:
     """Return whether an outcome has finite numbers of the right shapes for a model, and could be followed."""
     decision = outcome.decision
-    forecasts = [outcome.forecast] if decision is None else [outcome.forecast, decision.forecast]
+    forecasts = [outcome.expected] if decision is None else [outcome.expected, decision.expected]
     path = None if decision is None else decision.drive.path
     parts: list[tuple[Array, tuple[int, ...]]] = []
     for x in forecasts:
@@ -107,9 +107,9 @@ class Candidates:
         end = self._forecaster.end_of(start)
         present = self._forecaster.run(start, end)
         if self._arrives(present):
-            return Outcome(True, present)
+            return Outcome(True, present.expected)
         if is_noisy and start.drive.mode is Mode.TRACK:
-            return Outcome(False, present)
+            return Outcome(False, present.expected)
         search = _Search(start, end, present, is_moving, seed, _STEP_TIME * len(present.t))
         better = [*self._faster(search)]
         hurried = [one for one in better if one.arrives and one.cost < 1.1 * present.rms_error]
@@ -117,10 +117,10 @@ class Candidates:
             better += self._paths(search, self._planner)
         ready = [one for one in better if one.t >= start.t + min(search.effort, self._config.lead) - 1e-9]
         if not ready:
-            return Outcome(False, present)
+            return Outcome(False, present.expected)
         best = min(ready, key=lambda one: (not one.arrives, one.cost if one.arrives else one.forecast.final_error))
         drive = best.drive._replace(reason=self._reason(best, search)) if best.drive.mode is not Mode.TRACK else TRACK
-        return Outcome(False, present, Decision(best.t, drive, best.forecast))
+        return Outcome(False, present.expected, Decision(best.t, drive, best.forecast.expected))
 
     def _faster(self, search: _Search) -> Iterator[_Candidate]:
         """Roll out the other of tasks with the rows of the law, and of a fast finish."""

@@ -19,6 +19,7 @@ from qpavoid.control.settings import ControlSettings
 from qpavoid.control.tasks import FrameTask, RowTask
 from qpavoid.control.tasks.relative import Relative
 from qpavoid.control.trajectories import extrapolate
+from qpavoid.model.cloud import Points, Voxels
 from qpavoid.model.sample import Sample
 from qpavoid.model.trajectory import Trajectory
 from qpavoid.planning.drive import Drive, Driver
@@ -46,8 +47,21 @@ class Snapshot(NamedTuple):
     """What it follows."""
     obstacles: Mapping[str, Array]
     """(18,) states of those that a program gives, by name."""
+    clouds: Mapping[str, Voxels]
+    """What is in point clouds among them that were given points."""
     targets: Mapping[str, Any]
     """Targets that a program gives, by name of the task; they are taken to stay where they are."""
+
+
+class Expected(NamedTuple):
+    """What a forecast lets one expect: all of it that a controller compares with what comes."""
+
+    t: Array
+    """(n + 1,) [s]."""
+    q: Array
+    """(n + 1, nq)."""
+    errors: Array
+    """(n + 1,) largest error of a frame [m, rad]."""
 
 
 class Forecast(NamedTuple):
@@ -74,6 +88,11 @@ class Forecast(NamedTuple):
         return min(max(round(float((t - self.t[0]) / (self.t[-1] - self.t[0]) * steps)), 0), steps) if steps else 0
 
     @property
+    def expected(self) -> Expected:
+        """What it lets one expect."""
+        return Expected(self.t, self.q, self.errors)
+
+    @property
     def rms_error(self) -> float:
         """Root mean square of the errors [m, rad]."""
         return float(np.sqrt(np.mean(self.errors**2)))
@@ -82,11 +101,6 @@ class Forecast(NamedTuple):
     def final_error(self) -> float:
         """Largest error of a frame at the end [m, rad]."""
         return float(self.errors[-1])
-
-
-def largest_error(parts: Array) -> float:
-    """Return the largest error of frames, of their positions and orientations (3 (p + t),) [m, rad]."""
-    return float(np.linalg.norm(parts.reshape(-1, 3), axis=1).max())
 
 
 class Forecaster(SceneChanges):
@@ -154,7 +168,7 @@ class Forecaster(SceneChanges):
         errors, clearance = np.zeros((count + 1, len(rows.frame_errors))), np.full(count + 1, np.inf)
         q[0], v[0], dv[0] = start.q, start.v, start.dv
         self._restart(start)
-        obstacles = {name: Sample.of_row(row) for name, row in start.obstacles.items()} or None
+        obstacles = _updates(start)
         stalled: tuple[Reason, ...] = ()
         for k in range(count + 1):
             updates = obstacles if k == 0 else None
@@ -222,6 +236,14 @@ class Forecaster(SceneChanges):
         self._least[:] = np.where(is_movable, distances.d1, -np.inf)
         pairs = distances.pair
         self._least[pairs] = np.minimum(self._least[pairs], distances.d - _PRESENT)
+
+
+def _updates(start: Snapshot) -> dict[str, Sample | Points] | None:
+    """Return what a step is given of obstacles, None of none; points stay as they are."""
+    updates: dict[str, Sample | Points] = {name: Sample.of_row(row) for name, row in start.obstacles.items()}
+    for name, voxels in start.clouds.items():
+        updates[name] = Points(voxels, Sample.of_row(start.obstacles[name]), at_rest=True)
+    return updates or None
 
 
 def _part(target: Any, moves: bool, turns: bool) -> Any:

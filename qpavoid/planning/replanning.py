@@ -7,15 +7,17 @@ from typing import Any
 
 import numpy as np
 
+from qpavoid import kernels
 from qpavoid.config import Planning
 from qpavoid.control.builder import ProblemBuilder, StepProblem
 from qpavoid.control.contacts import ContactRows
 from qpavoid.control.settings import ControlSettings
 from qpavoid.control.tasks import FrameTask, RowTask
-from qpavoid.model.sample import Sample
+from qpavoid.model.cloud import Voxels
+from qpavoid.model.sample import STATE, Sample
 from qpavoid.planning.candidates import Decision, is_sound
 from qpavoid.planning.drive import TRACK, Driver
-from qpavoid.planning.forecast import Forecast, Snapshot, largest_error
+from qpavoid.planning.forecast import Expected, Snapshot
 from qpavoid.planning.worker import Answer, Parts, Question, Worker, make_worker
 from qpavoid.problem import Array, Solution
 from qpavoid.reason import Reason, ReasonKind
@@ -38,6 +40,7 @@ _MEASURED = 20
 """Differences after which the mean counts; before that, obstacles that move may be noisy [-]."""
 _ROUND_OFF = 1e-9
 """Difference of two times that counts as none [s]."""
+_NO_STATES: Array = np.zeros((0, STATE))
 
 
 class Replanning:
@@ -70,18 +73,29 @@ class Replanning:
         self._worker: Worker | None = None
         if self._no_plan is None and isinstance(law, NamedSolver):
             self._worker = make_worker(Parts(settings, tasks, contacts, law.config, config))
+        self._load_kernels()
         self.reset()
+
+    def _load_kernels(self) -> None:
+        """Load the kernels that compare what comes with a forecast: no step compiles them."""
+        which, states = self._builder.tracker.external[:0], self._builder.tracker.current.states
+        q, errors = self._builder.rows.q, self._builder.rows.frame_errors
+        kernels.strays(q, errors, 0.0, np.zeros(1), q[None].copy(), np.zeros(1), _CHANGED, _TURNED)
+        kernels.any_displaced(states, which, _NO_STATES, _CHANGED, _TURNED)
+        kernels.any_moves(states, which)
+        kernels.surprise(states, which, _NO_STATES, self._settings.dt)
 
     def reset(self) -> None:
         """Drop all plans; the next step looks ahead."""
         self._driver.begin(TRACK)
         self._pending: Decision | None = None
-        self._expected: Forecast | None = None
+        self._expected: Expected | None = None
         self._question: Question | None = None
-        self._last_obstacles = dict[str, Array]()  # states in the last look
+        self._asked_states = _NO_STATES  # of obstacles that a program gives, in the last look
+        self._asked_clouds = dict[int, Voxels]()  # what was in clouds then
         self._last_look, self._next_look, self._wait = -np.inf, -np.inf, self._config.period
         self._looks = 0
-        self._last_states: Array | None = None
+        self._last_states = _NO_STATES  # in the step before
         self._noise, self._measured = 0.0, 0  # mean square [m²], number of differences
 
     def change_law(self, law: Solver) -> None:
@@ -125,7 +139,7 @@ class Replanning:
             self._next_look = min(self._next_look, self._last_look + self._wait)
         if self._pending is not None and step.t + dt >= self._pending.t - _ROUND_OFF:
             self._driver.begin(self._pending.drive)
-            self._expected, self._next_look = self._pending.forecast, step.t + self._config.period
+            self._expected, self._next_look = self._pending.expected, step.t + self._config.period
             self._pending = None
         notes = self._notes if self._no_plan is None else (self._no_plan,)
         if drive.reason or notes:
@@ -143,43 +157,42 @@ class Replanning:
         expected, tracker = self._expected, self._builder.tracker
         if expected is None:
             return True
-        k = expected.step_at(step.t)
-        error = largest_error(self._builder.rows.frame_errors)
-        if abs(error - expected.errors[k]) > _CHANGED or np.abs(step.q - expected.q[k]).max() > _TURNED:
+        if kernels.strays(
+            step.q, self._builder.rows.frame_errors, step.t, expected.t, expected.q, expected.errors, _CHANGED, _TURNED
+        ):
             return True
-        if len(tracker.external) != len(self._last_obstacles):
+        which, states = tracker.external, tracker.current.states
+        if len(which) != len(self._asked_states):
             return True
-        states = tracker.current.states[tracker.external]
-        if not len(states) or self._moves(states):
+        if any(voxels is not self._asked_clouds.get(i) for i, voxels in tracker.current.voxels.items()):
+            return True
+        if not len(which) or kernels.any_moves(states, which):
             return False  # then looks are periodic
-        change = np.abs(states - np.array(list(self._last_obstacles.values())))
-        return bool((change[:, 9:12] > _CHANGED).any() or (change[:, :9] > _TURNED).any())
-
-    @staticmethod
-    def _moves(states: Array) -> bool:
-        """Return whether any obstacle whose future is not known moves."""
-        return bool(states[:, 12:].any())
+        return bool(kernels.any_displaced(states, which, self._asked_states, _CHANGED, _TURNED))
 
     def _measure_noise(self) -> None:
         """Compare positions of obstacles with those that the twists of the step before lead to."""
-        tracker = self._builder.tracker
-        states, last = tracker.current.states[tracker.external], self._last_states
-        if last is not None and len(last) == len(states):
-            difference = states[:, 9:12] - last[:, 9:12] - self._settings.dt * last[:, 12:15]
-            worst = float((difference * difference).sum(axis=1).max())
+        tracker, last = self._builder.tracker, self._last_states
+        which, states = tracker.external, tracker.current.states
+        if len(last) == len(which):
+            worst = kernels.surprise(states, which, last, self._settings.dt)
             self._measured += 1
             self._noise += max(_FORGETTING, 1.0 / self._measured) * (worst - self._noise)
-        self._last_states = states
+        else:
+            self._last_states = states[which]
 
     def _ask(self, step: StepProblem, worker: Worker) -> None:
         """Ask for a look ahead from a step."""
         tracker, previous = self._builder.tracker, self._builder.rows.previous
         slots, states = self._settings.scene.slots, tracker.current.states
-        self._last_obstacles = {slots[i].name: states[i].copy() for i in tracker.external.tolist()}
-        is_moving = self._moves(states[tracker.external])
+        asked, clouds = states[tracker.external], dict(tracker.current.voxels)
+        self._asked_states, self._asked_clouds = asked, clouds
+        obstacles = {slots[i].name: state for i, state in zip(tracker.external.tolist(), asked, strict=True)}
+        points = {name: clouds[i] for i, name in zip(tracker.external.tolist(), obstacles, strict=True) if i in clouds}
+        is_moving = bool(kernels.any_moves(states, tracker.external))
         is_noisy = is_moving and (self._measured < _MEASURED or self._noise > _NOISE**2)
         q, v, dv = step.q.copy(), previous.v.copy(), previous.dv.copy()
-        start = Snapshot(step.t, q, v, dv, self._driver.drive, self._last_obstacles, self._given_targets(step))
+        start = Snapshot(step.t, q, v, dv, self._driver.drive, obstacles, points, self._given_targets(step))
         self._number += 1
         self._question = Question(self._number, start, is_moving, is_noisy, self._looks)
         self._looks += 1
@@ -200,7 +213,7 @@ class Replanning:
             detail = answer.failure or "what it answers has the wrong shape, or is not finite"
             self._no_plan = Reason.of(ReasonKind.NO_PLAN, "worker", detail=detail)
             return
-        self._expected = outcome.forecast
+        self._expected = outcome.expected
         if outcome.arrives:
             self._next_look, self._wait = t + (period if question.is_moving else np.inf), period
         elif outcome.decision is None:

@@ -11,6 +11,7 @@ import pickle
 import subprocess
 import sys
 from collections.abc import Sequence
+from copy import deepcopy
 from queue import SimpleQueue
 from threading import Thread
 from typing import Any, BinaryIO, NamedTuple, Protocol
@@ -116,17 +117,17 @@ class ProcessWorker:
         """Start the process, and wait until it is ready, or has failed."""
         pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
         self.process = subprocess.Popen([sys.executable, "-c", _SERVE], **pipes)  # type: ignore[call-overload]
-        self._messages, self._answers = SimpleQueue[bytes](), SimpleQueue[Answer]()
-        Thread(target=_write, args=(self.process.stdin, self._messages), daemon=True).start()
+        self._messages, self._answers = SimpleQueue[Any](), SimpleQueue[Answer]()
+        Thread(target=_write, args=(self.process.stdin, self._messages, self._answers), daemon=True).start()
         Thread(target=_read, args=(self.process, self._answers), daemon=True).start()
-        self._send(parts)
+        self._messages.put(parts)
         first = self._answers.get()
         if first.number < 0:
             self._answers.put(first)
 
     def ask(self, question: Question) -> None:
         """See `Worker`."""
-        self._send(question)
+        self._messages.put(question)
 
     def poll(self) -> Answer | None:
         """See `Worker`."""
@@ -134,17 +135,10 @@ class ProcessWorker:
 
     def change(self, method: str, *arguments: Any) -> None:
         """See `Worker`."""
-        self._send((method, arguments))
-
-    def _send(self, message: Any) -> None:
-        """Leave a message to the thread that waits for the process to take it."""
-        try:
-            self._messages.put(pickle.dumps(message))
-        except Exception as error:  # a task of the user's own may not be pickled
-            self._answers.put(Answer(-1, None, f"it cannot be sent: {type(error).__name__}: {error}"))
+        self._messages.put((method, deepcopy(arguments)))  # as they are now
 
     def __del__(self) -> None:
-        self._messages.put(b"")  # closes the pipe, at whose end the process ends
+        self._messages.put(None)  # closes the pipe, at whose end the process ends
 
 
 def make_worker(parts: Parts) -> Worker:
@@ -159,13 +153,13 @@ def serve() -> None:
     worker = InlineWorker(pickle.load(source))
     answer: Answer | None = Answer(0, None)  # it is ready
     while True:
-        if answer is not None:
-            pickle.dump(answer, answers)
-            answers.flush()
         try:
+            if answer is not None:
+                pickle.dump(answer, answers)
+                answers.flush()
             message = pickle.load(source)
-        except EOFError:
-            return
+        except (EOFError, BrokenPipeError):  # the pipe is closed at its other end
+            os._exit(0)
         if isinstance(message, Question):
             worker.ask(message)
         else:
@@ -173,12 +167,17 @@ def serve() -> None:
         answer = worker.poll()
 
 
-def _write(pipe: BinaryIO, messages: SimpleQueue[bytes]) -> None:
-    """Write messages to a process until one is empty, or it is no more."""
+def _write(pipe: BinaryIO, messages: SimpleQueue[Any], answers: SimpleQueue[Answer]) -> None:
+    """Write messages to a process until one is None, or it is no more; they are pickled here, not in a step."""
     try:
         with pipe:
-            while message := messages.get():
-                pipe.write(message)
+            while (message := messages.get()) is not None:
+                try:
+                    text = pickle.dumps(message)
+                except Exception as error:  # a task of the user's own may not be pickled
+                    answers.put(Answer(-1, None, f"it cannot be sent: {type(error).__name__}: {error}"))
+                    continue
+                pipe.write(text)
                 pipe.flush()
     except OSError:
         pass  # the reader says so

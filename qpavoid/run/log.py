@@ -18,19 +18,22 @@ from qpavoid.run.metrics import path_deviation, torque_figures
 
 STATUSES = tuple(Status)
 """Status of each code in `Log.status`."""
-_FORMAT = 8
+_FORMAT = 9
 _SHAPES = {
     "t": "N", "q": "N nq", "v": "N nv",
     "target": "N k 3", "tool": "N k 3", "tool_rotation": "N k 3 3", "turn_error": "N k",
     "task_error": "N s",
     "body_distance": "N b", "body_pair": "N b", "closest_pair": "N", "alpha": "N", "beta": "N", "status": "N",
     "slack": "N", "saturation": "N", "build_time": "N", "solve_time": "N", "command_scale": "N", "stalled": "N",
-    "severity": "N",
+    "planned": "N", "severity": "N",
     "body_ends": "N b 2 3", "obstacle_position": "N o 3", "obstacle_rotation": "N o 3 3",
     "torque": "N m", "contact_force": "N c 3", "slip": "N c",
 }  # fmt: skip
 """Shape of each array; a letter is the same number wherever it stands."""
-_TYPES = {"closest_pair": np.intp, "body_pair": np.intp, "status": np.int8, "stalled": np.bool_, "severity": np.int8}
+_TYPES = {
+    "closest_pair": np.intp, "body_pair": np.intp, "status": np.int8, "stalled": np.bool_, "planned": np.bool_,
+    "severity": np.int8,
+}  # fmt: skip
 """Type of an array's numbers, where they are not floating point."""
 _MAX_EVENTS = 20
 """Number of changes of reasons that are among the figures of a run: what a reader of JSON can take in."""
@@ -80,6 +83,8 @@ class Log:
     """(N,) fraction of the solver's velocity that was commanded after the stop look-ahead; the rest was a stop's."""
     stalled: npt.NDArray[np.bool_]
     """(N,) whether the tasks made no progress."""
+    planned: npt.NDArray[np.bool_]
+    """(N,) whether a path or a fast finish was followed, see `Solution.plan`."""
     severity: npt.NDArray[np.int8]
     """(N,) worst severity of the step's reasons, see `qpavoid.reason.Severity`; 0 without reasons."""
     saturation: Array

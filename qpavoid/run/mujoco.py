@@ -24,6 +24,10 @@ try:
 except ImportError:
     raise ConfigError("MuJoCo is not installed: pip install mujoco") from None
 
+FLOATING = "JointModelFreeFlyer"
+"""What pinocchio calls the joint of a base that floats."""
+_ORDERS = {1: np.arange(1), 7: np.array([0, 1, 2, 4, 5, 6, 3])}
+"""Places of a joint's coordinates among MuJoCo's, of which a quaternion's w comes first, by their number."""
 MAX_DISTANCE = 100.0
 """Largest distance that MuJoCo looks for [m]: beyond any scene."""
 
@@ -43,7 +47,7 @@ class MujocoModel:
     geoms: IntArray
     """(g,) MuJoCo geom of each of the scene's geometries."""
     q_index: IntArray
-    """(nv,) place in qpos of each coordinate."""
+    """(nq,) place in qpos of each coordinate."""
     v_index: IntArray
     """(nv,) place in qvel of each coordinate."""
     bodies: int
@@ -55,7 +59,7 @@ class MujocoModel:
         return np.any(self.scene.support != 0.0, axis=1)
 
     def place(self, q: Array, t: float) -> None:
-        """Put the robot to q (nv,) and the obstacles to their poses at t [s]."""
+        """Put the robot to q (nq,) and the obstacles to their poses at t [s]."""
         self.data.qpos[self.q_index] = q
         for i, obstacle in enumerate(self.scene.slots):
             if obstacle.moves:
@@ -63,7 +67,13 @@ class MujocoModel:
         mujoco.mj_kinematics(self.model, self.data)
 
     def integrate(self, q: Array, v: Array, dt: float) -> Array:
-        """Integrate v (nv,) from q (nv,) over dt [s] by MuJoCo; return q (nv,)."""
+        """Integrate v (nv,) from q (nv,) over dt [s] by MuJoCo; return q (nv,).
+
+        Raises:
+            ValueError: the base floats, whose velocity MuJoCo has in other axes.
+        """
+        if len(q) != len(v):
+            raise ValueError("a base that floats is placed, not integrated")
         position, velocity = np.zeros(self.model.nq), np.zeros(self.model.nv)
         position[self.q_index], velocity[self.v_index] = q, v
         mujoco.mj_integratePos(self.model, position, velocity, dt)
@@ -88,7 +98,7 @@ def place_mocap(data: Any, index: int, sample: Sample) -> None:
 
 
 def build(scene: Scene, q0: Array, has_servos: bool = False) -> MujocoModel:
-    """Build the MuJoCo model of a scene: one body a joint, one mocap body an obstacle.
+    """Build the MuJoCo model of a scene: one body a joint, one mocap body an obstacle; a base may float.
 
     Args:
         scene: what is written.
@@ -96,7 +106,7 @@ def build(scene: Scene, q0: Array, has_servos: bool = False) -> MujocoModel:
         has_servos: whether bodies have the masses of the robot's model, and each joint a motor, without any gain yet.
 
     Raises:
-        ValueError: a joint that is neither a hinge nor a slide, or a shape that MuJoCo does not know.
+        ValueError: another joint that is neither a hinge nor a slide, or a shape that MuJoCo does not know.
     """
     spec, robot = mujoco.MjSpec(), scene.robot.model
     spec.compiler.degree = False
@@ -112,6 +122,10 @@ def build(scene: Scene, q0: Array, has_servos: bool = False) -> MujocoModel:
             name=robot.names[i], pos=placement.translation, quat=quaternion(placement.rotation),
             explicitinertial=True, **body_inertia(robot.inertias[i] if has_servos else pin.Inertia.Zero()),
         )  # fmt: skip
+        if robot.joints[i].shortname() == FLOATING:
+            body.add_freejoint(name=robot.names[i])
+            bodies.append(body)
+            continue
         joint = add_joint(body, robot, i)
         if robot.joints[i].idx_q in ranges:  # neither kinematics nor integration heed them; who reads the model may
             joint.limited, joint.range = True, ranges[robot.joints[i].idx_q]
@@ -134,8 +148,8 @@ def build(scene: Scene, q0: Array, has_servos: bool = False) -> MujocoModel:
         model=model,
         data=mujoco.MjData(model),
         geoms=np.array([model.geom(f"geometry {i}").id for i in range(scene.geometry.ngeoms)], dtype=np.intp),
-        q_index=np.array([joint.qposadr[0] for joint in joints], dtype=np.intp),
-        v_index=np.array([joint.dofadr[0] for joint in joints], dtype=np.intp),
+        q_index=np.concatenate([joint.qposadr[0] + _ORDERS[len(joint.qpos0)] for joint in joints]),
+        v_index=np.concatenate([joint.dofadr[0] + np.arange(len(joint.damping)) for joint in joints]),
         bodies=first,
     )
     for i, obstacle in enumerate(scene.slots):

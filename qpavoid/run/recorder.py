@@ -18,7 +18,7 @@ from qpavoid.controller import Controller
 from qpavoid.geometry.bodies import enclosing_capsule, surface_triangles
 from qpavoid.model.kinematics import ForwardKinematics
 from qpavoid.model.robot import Robot
-from qpavoid.model.sample import STATE
+from qpavoid.model.sample import POSE, STATE
 from qpavoid.model.scene import PARKING_DISTANCE, Obstacle, Scene
 from qpavoid.problem import Array, Solution, Status
 from qpavoid.reason import Reason, ReasonKind
@@ -30,6 +30,9 @@ if TYPE_CHECKING:
 
 _MAX_EVENTS = 1000
 """Number of events that a log keeps: a run that changes its reasons at every step would fill memory."""
+
+_CHUNK = 64
+"""Steps whose poses and distances are kept until they are stored together: array functions cost as much for one."""
 
 
 class Recorder:
@@ -58,11 +61,13 @@ class Recorder:
         self._moving = [i for i, obstacle in enumerate(scene.slots) if obstacle.moves]
         self._bodies = np.arange(len(self._ends))
         self._joints = np.array([body.parentJoint for body in scene.robot.bodies.geometryObjects], dtype=np.intp)
+        self._distance = np.full((_CHUNK, len(self._pairs) + 1), np.inf)
+        self._placed, self._posed = np.zeros((_CHUNK, count, POSE)), np.zeros((_CHUNK, len(self._joints), POSE))
+        self._count = self._flushed = 0
         self._notice_obstacles()
         self._count_pairs()
         self._events: list[list[Any]] = []
         self._keys: tuple[object, ...] = ()
-        self._count = 0
 
     def add(self, tick: Tick) -> None:
         """Store one step."""
@@ -76,6 +81,7 @@ class Recorder:
         for name in ("command_scale", "saturation", "build_time", "solve_time"):
             x[name][i] = getattr(solution, name)
         x["stalled"][i], x["severity"][i] = bool(solution.stalled), solution.severity or 0
+        x["planned"][i] = bool(solution.plan)
         x["status"][i] = STATUSES.index(solution.status)
         x["slack"][i] = 0.0 if solution.slack is None else np.max(solution.slack, initial=0.0)
         if len(near.d):
@@ -86,6 +92,8 @@ class Recorder:
             x["slip"][i] = self._plant.slip()
         self._write_bodies(tick)
         self._count += 1
+        if self._count - self._flushed == _CHUNK:
+            self._flush()
         self._record_events(state.t, solution)
 
     def _record_events(self, t: float, solution: Solution) -> None:
@@ -132,35 +140,44 @@ class Recorder:
         self._attached = attached
 
     def _write_bodies(self, tick: Tick) -> None:
-        """Store the distances of all pairs, and the poses of bodies and obstacles, NaN of those that are not there."""
-        scene, n, x = self._scene, self._count, self._arrays
-        if scene.pair_names is not self._names:
+        """Keep poses of bodies and obstacles, and the distances of all pairs, for `_flush`."""
+        scene, n = self._scene, self._count - self._flushed
+        if scene.pair_names is not self._names or self._controller.attached != self._attached:
+            self._flush()
             self._notice_obstacles()
-        if self._controller.attached != self._attached:
             self._count_pairs()
+            n = 0
         self._kinematics.compute(tick.state.q)
         states = self._states
         states[:, :12] = tick.obstacles
         for i in self._moving if self._scenario.latency else ():  # the step takes them to be where they are later
             if scene.slots[i].name not in self._attached:
                 states[i, :12] = scene.slots[i].motion.sample(tick.state.t).row[:12]
-        x["obstacle_position"][n, self._columns] = states[self._present, 9:12]
-        x["obstacle_rotation"][n, self._columns] = states[self._present, :9].reshape(-1, 3, 3).transpose(0, 2, 1)
         self._query.place(ObstacleStates(self._numbers, states, self._margin, {}))
         self._query.compute(self._kinematics.joint_poses, np.inf)
-        distance, pairs = np.full(len(scene.pairs) + 1, np.inf), self._query.pairs
-        distance[pairs] = self._query.arrays.results[pairs, 0]
+        pairs = self._query.pairs
+        self._distance[n, pairs] = self._query.arrays.results[pairs, 0]
+        self._placed[n], self._posed[n] = states[:, :12], self._kinematics.joint_poses[self._joints]
+
+    def _flush(self) -> None:
+        """Store what is kept of the last steps: distances, and poses, NaN of obstacles that are not there."""
+        x, first, count, numbers = self._arrays, self._flushed, self._count - self._flushed, self._pair_numbers
+        rows, distance, placed, posed = slice(first, first + count), self._distance, self._placed, self._posed[:count]
+        x["obstacle_position"][rows, self._columns] = placed[:count, self._present, 9:]
+        rotations = placed[:count, self._present, :9].reshape(count, -1, 3, 3)
+        x["obstacle_rotation"][rows, self._columns] = rotations.transpose(0, 1, 3, 2)
         distance[distance > 0.5 * PARKING_DISTANCE] = np.inf
-        least = int(np.argmin(distance))
-        if distance[least] < np.inf:
-            x["closest_pair"][n] = self._pair_numbers[least]
-        near = distance[self._pairs_of]
-        nearest = near.argmin(axis=1)
-        x["body_distance"][n] = near[self._bodies, nearest]
-        x["body_pair"][n] = self._pair_numbers[self._pairs_of[self._bodies, nearest]]
-        poses = self._kinematics.joint_poses[self._joints]
-        R, p = poses[:, :9].reshape(-1, 3, 3), poses[:, None, 9:]  # by columns: that is Rᵀ
-        x["body_ends"][n] = self._ends @ R + p
+        least = distance[:count].argmin(axis=1)
+        is_some = distance[np.arange(count), least] < np.inf
+        x["closest_pair"][rows] = np.where(is_some, numbers[least], -1)
+        near = distance[:count, self._pairs_of]
+        nearest = near.argmin(axis=2)
+        x["body_distance"][rows] = np.take_along_axis(near, nearest[..., None], axis=2)[..., 0]
+        x["body_pair"][rows] = numbers[self._pairs_of[self._bodies, nearest]]
+        R, p = posed[..., :9].reshape(count, -1, 3, 3), posed[:, :, None, 9:]  # by columns: that is Rᵀ
+        x["body_ends"][rows] = self._ends @ R + p
+        distance.fill(np.inf)
+        self._flushed = self._count
 
     def log(self, stopped_by: str | None = None) -> Log:
         """Return the steps stored so far as a log.
@@ -168,6 +185,7 @@ class Recorder:
         Args:
             stopped_by: why the run ended before its time, if it did.
         """
+        self._flush()
         scene, robot, plant = self._scene, self._scene.robot, self._plant
         bounds = robot.bounds()
         meta = {

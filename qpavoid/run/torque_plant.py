@@ -14,7 +14,7 @@ from qpavoid.config.plant import Payload, PlantSettings
 from qpavoid.errors import ConfigError
 from qpavoid.model.robot import Robot
 from qpavoid.problem import Array, Solution, require_finite
-from qpavoid.run.mujoco import add_joint, body_inertia, quaternion
+from qpavoid.run.mujoco import FLOATING, add_joint, body_inertia, quaternion
 
 STEP = 1e-3
 """Largest time step of the dynamics [s]."""
@@ -91,7 +91,7 @@ class TorquePlant:
                 name=model.names[i], pos=placement.translation, quat=quaternion(placement.rotation),
                 explicitinertial=True, **body_inertia(inertias[i]),
             )  # fmt: skip
-            if joint.shortname() == "JointModelFreeFlyer":
+            if joint.shortname() == FLOATING:
                 body.add_freejoint(name=model.names[i])
             else:
                 armature = model.armature[joint.idx_v] if settings.armature is None else settings.armature

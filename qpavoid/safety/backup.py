@@ -35,8 +35,10 @@ from qpavoid.safety.rollout import LEAST_SCORE, BackupPolicy, BackupRollouts, Ba
 
 _PERIOD_FRACTION = 0.128
 """Fraction of a control period in which candidates are computed [-]."""
-_POSE_TIME, _SEARCH_TIME = 12e-6, 80e-6
+_POSE_TIME, _SEARCH_TIME = 10.5e-6, 80e-6
 """Time that a pose of a candidate takes, and that a search takes besides [s]: of a Panda among 50 obstacles."""
+_BEGIN_POSES = 8
+"""Poses that take as long as it takes to begin a candidate [-]: at its first pose, all distances are new."""
 _FEWEST_POSES = 10
 """Poses that are evaluated in a control step at least [-]: a candidate has about 45, and an obstacle does not wait."""
 _HORIZONS = (0.2, 0.05, 0.5)
@@ -48,6 +50,8 @@ _BIAS_SPEEDS = (2.0, 30.0)
 _CANDIDATES_AHEAD = 3
 """Candidates that can be computed before the kept trajectory is no longer valid [-]: as many may fail. It holds the
 velocity of the solver as long, and the next one is begun so early."""
+_STEPS_BETWEEN = 4
+"""Control steps between two checks that the kept trajectory lasts so long [-], where all motions are known."""
 _FIRST_CANDIDATES = 7
 """Candidates that are tried near an obstacle before one is followed that does not suffice [-]."""
 _URGENT = 0.5
@@ -89,8 +93,10 @@ class BackupPlanner:
         self._rollouts = BackupRollouts(settings, query.table, obstacles)
         self._approach = ApproachCheck(settings, query, self._rollouts.lever_arm, obstacles)
         self._poses = max(_FEWEST_POSES, round((_PERIOD_FRACTION * settings.dt - _SEARCH_TIME) / _POSE_TIME))
-        """Poses of candidates that are evaluated in a control step: 100 at 100 Hz, 15 at 500 Hz."""
-        self._steps_ahead = ceil(_CANDIDATES_AHEAD * self._rollouts.usual_poses / self._poses)
+        """Poses of candidates that are evaluated in a control step: 114 at 100 Hz, 17 at 500 Hz."""
+        self._candidate_poses = self._rollouts.usual_poses + _BEGIN_POSES
+        """Poses that take as long as a candidate."""
+        self._steps_ahead = ceil(_CANDIDATES_AHEAD * self._candidate_poses / self._poses)
         """Control steps in which that many candidates are computed."""
         self._budget = settings.budget
         self.is_cut = False
@@ -115,6 +121,8 @@ class BackupPlanner:
         """Kept, from the present state on."""
         self._kind, self._age = -1, 0
         """Of the candidate, -1 without one; control steps since it began."""
+        self._lasting_steps = 0
+        """Control steps for which the kept trajectory is known to last long enough."""
         self._tried, self._sampled, self._untried = [0, 0], 0, _FIRST_CANDIDATES
         self._moving = self._obstacles.moving
 
@@ -171,7 +179,7 @@ class BackupPlanner:
         """Return the enabled pairs (m,), without those in contact."""
         enabled = self._rollouts.enabled
         enabled[proximity.pair[proximity.distance < TOUCH]] = False
-        if not np.array_equal(enabled, self._last_enabled):
+        if enabled.tobytes() != self._last_enabled.tobytes():
             self._last_enabled = enabled
         return self._last_enabled  # the same array, so that it need not be compared again
 
@@ -203,6 +211,7 @@ class BackupPlanner:
                 if self._steps_needed(poses) > self._steps_needed(self._poses) or self._lasts(command):
                     break
                 self._begin(command, is_valid, poses)
+                poses = max(poses - _BEGIN_POSES, 1)
             portion = min(poses, _PORTION) if self._budget.is_limited else poses
             try:
                 code = rollouts.resume(portion)
@@ -220,9 +229,9 @@ class BackupPlanner:
                 continue
             candidate = rollouts.advance(candidate, self._age)
             if kind == _ALONE:
-                self._backup = candidate
+                self._backup, self._lasting_steps = candidate, 0
             elif self._is_acceptable(candidate, command.after_task):
-                self._backup, command = candidate, command.to_task()
+                self._backup, self._lasting_steps, command = candidate, 0, command.to_task()
                 if candidate.score >= rollouts.sufficient_score:
                     self._tried, self._sampled, self._untried, is_valid = [0, 0], 0, 0, True
                     if self._age == 0:
@@ -231,8 +240,20 @@ class BackupPlanner:
 
     def _lasts(self, command: _Command) -> bool:
         """Return whether the kept trajectory will be valid until others are known, if the same is commanded."""
-        start, backup, steps = command.after, self._backup, self._steps_ahead
-        if backup is None or not command.is_task or len(backup.v) <= steps:
+        if self._backup is None or not command.is_task:
+            return False
+        if self._lasting_steps > 0:
+            self._lasting_steps -= 1
+            return True
+        if len(self._obstacles.external) == 0 and self._is_valid_after(self._steps_ahead + _STEPS_BETWEEN - 1, command):
+            self._lasting_steps = _STEPS_BETWEEN - 1
+            return True
+        return self._is_valid_after(self._steps_ahead, command)
+
+    def _is_valid_after(self, steps: int, command: _Command) -> bool:
+        """Return whether the kept trajectory will be valid some steps later, if the same is commanded."""
+        start, backup = command.after, self._backup
+        if backup is None or len(backup.v) <= steps:
             return False
         q = pin.integrate(self._model, start.q, steps * self._dt * start.v)
         later = Start(q, start.v, np.zeros_like(start.v), start.t + steps * self._dt, start.enabled)
@@ -293,7 +314,7 @@ class BackupPlanner:
 
     def _steps_needed(self, poses: int) -> int:
         """Return the control steps after this one that a trajectory takes with so many poses in this one."""
-        return max(0, ceil((self._rollouts.usual_poses - poses) / self._poses))
+        return max(0, ceil((self._candidate_poses - poses) / self._poses))
 
     def _not_worse(self, later: BackupScore, now: BackupScore) -> bool:
         """Return whether a trajectory that begins in the next control step is not worse than one that begins now.

@@ -1,6 +1,6 @@
 """Rollouts of backup trajectories: the robot drops its tasks and keeps away from everything.
 
-Obstacles follow their trajectories, or are predicted at constant velocity. In every period a backup trajectory
+Obstacles follow their trajectories, or are predicted on lines and arcs. In every period a backup trajectory
 maximises the smallest distance at a horizon h, to first order:
 
     max s - ½ s²/c - ε/2c ‖v - v̂‖²  s.t.  d + h (J v + ḋ_obs) >= s,  s <= c,  lower <= v <= upper
@@ -193,18 +193,19 @@ class BackupRollouts:
     @property
     def enabled(self) -> Mask:
         """(m,) pairs whose distance depends on a joint, and that may not come into contact."""
-        return np.asarray(self.query.table.separable & ~self.query.table.ignored)
+        return np.greater(self.query.table.separable, self.query.table.ignored)
 
     def advance(self, trajectory: BackupTrajectory, steps: int = 1) -> BackupTrajectory:
         """Return a trajectory without its first control steps, which are as many as it has at the most."""
         if steps == 0:
             return trajectory
-        start, score, v, last = trajectory.start, trajectory.score, trajectory.v, steps - 1
-        v_prev = start.v if last == 0 else v[last - 1]
-        start = Start(trajectory.q[last], v[last], v[last] - v_prev, start.t + steps * self._dt, start.enabled)
+        start, v, q, policy, score, contact_time, clearance, prediction = trajectory
+        last, elapsed = steps - 1, steps * self._dt
+        dv = v[last] - (start.v if last == 0 else v[last - 1])
+        start = Start(q[last], v[last], dv, start.t + elapsed, start.enabled)
         if score.time_to_contact < HORIZON:
-            score = score._replace(time_to_contact=score.time_to_contact - steps * self._dt)
-        return trajectory._replace(start=start, v=v[steps:], q=trajectory.q[steps:], score=score)
+            score = score._replace(time_to_contact=score.time_to_contact - elapsed)
+        return BackupTrajectory(start, v[steps:], q[steps:], policy, score, contact_time, clearance, prediction)
 
     def is_valid_from(self, trajectory: BackupTrajectory, start: Start, max_obstacle_speed: float = 0.0) -> bool:
         """Return whether a sufficient trajectory is certainly so from a start close to its own, without a rollout.
@@ -216,8 +217,8 @@ class BackupRollouts:
         """
         if trajectory.contact_time < start.t + HORIZON - 1e-9:
             return False
-        delay = abs(start.t - trajectory.start.t)
-        if delay > self._dt or not _is_equal(trajectory.start.enabled, start.enabled):
+        delay, one, two = abs(start.t - trajectory.start.t), trajectory.start.enabled, start.enabled
+        if delay > self._dt or not (one is two or np.array_equal(one, two)):
             return False
         offset = pin.difference(self._model, trajectory.start.q, start.q)
         v, dv = np.ascontiguousarray(start.v), np.ascontiguousarray(start.dv)
@@ -338,10 +339,6 @@ def lay_out_pairs(query: DistanceQuery) -> PairMemory:
         points=np.zeros((m, 6)),
         due=np.zeros(m, np.intp),
     )
-
-
-def _is_equal(a: Mask, b: Mask) -> bool:
-    return a is b or np.array_equal(a, b)
 
 
 def _ramp_limits(bounds: JointBounds, dt: float) -> RampLimits:

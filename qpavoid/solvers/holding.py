@@ -15,7 +15,7 @@ from qpavoid.solvers.backends import TOLERANCE
 _SMALL = 1e-6
 """Softness of the holding rows [rad²]: small, with digits to spare."""
 _MIN_RELAXATION = 5.0 * TOLERANCE
-"""Violation of a holding row that counts [1/s]."""
+"""Violation of a row of holding [1/s] or balance [m/s] that counts."""
 _AT_LIMIT = 1e-5
 """Distance of a torque row from its bound below which the torque is at its limit [rad/s or m/s]."""
 _AT_EDGE = 1e-7
@@ -64,11 +64,16 @@ def dynamics_reasons(v: Array, problem: Problem, severity: Severity) -> list[Rea
         return []
     n, names, units = x.torque_rows, problem.joint_names, problem.joint_units
     violation = x.b - x.J @ v
-    lacking = np.max(violation[n:].reshape(-1, 2), axis=1, initial=-np.inf)
-    reasons = [
-        Reason.of(ReasonKind.HOLDING_RELAXED, names[x.actuated[r]], amount=float(lacking[r]), unit="1/s")
-        for r in np.flatnonzero(lacking > _MIN_RELAXATION).tolist()
-    ]
+    if x.points:
+        unbalanced = float(violation[n:].max(initial=-np.inf))
+        is_off = unbalanced > _MIN_RELAXATION
+        reasons = [Reason.of(ReasonKind.BALANCE_RELAXED, "centre of mass", amount=unbalanced, unit="m/s")] * is_off
+    else:
+        lacking = np.max(violation[n:].reshape(-1, 2), axis=1, initial=-np.inf)
+        reasons = [
+            Reason.of(ReasonKind.HOLDING_RELAXED, names[x.actuated[r]], amount=float(lacking[r]), unit="1/s")
+            for r in np.flatnonzero(lacking > _MIN_RELAXATION).tolist()
+        ]
     torques, cones = np.split(violation[:n], [n - kernels.ROWS_PER_POINT * len(x.points)])
     at_limit = torques.reshape(-1, 2).max(axis=1, initial=-np.inf) > -_AT_LIMIT
     for r in np.flatnonzero(at_limit).tolist():

@@ -19,10 +19,12 @@ from qpavoid.viz.style import (
     D2,
     DASHES,
     OBSTACLES,
+    PLAN,
     add_grid,
     add_legend,
     draw_levels,
     label_distances,
+    spans,
     units,
 )
 from qpavoid.viz.surfaces import capsule_faces, is_endless, moving_bodies, obstacle_faces, obstacle_path
@@ -49,18 +51,19 @@ def solver_styles(logs: Sequence[Log]) -> list[dict[str, Any]]:
     of one law with two back ends, show both their lines.
     """
     solvers: list[str] = [log.meta["solver"] for log in logs]
+    names = [log.meta["solver"] + " with planning" * bool(log.meta["config"].get("planning")) for log in logs]
     chosen = [SOLVER_STYLES.get(solver) if solver not in solvers[:i] else None for i, solver in enumerate(solvers)]
     used: list[tuple[str, Any]] = [style for style in chosen if style is not None]
     free = [(colour, dash) for dash in DASHES[::-1] for colour in COLOURS[::-1]]  # wide gaps first
     styles = []
-    for i, solver in enumerate(solvers):
+    for i, name in enumerate(names):
         style = chosen[i]
         if style is None:
             colours, dashes = zip(*used, strict=True) if used else ((), ())
             style = min(free, key=lambda s: (s in used, colours.count(s[0]), dashes.count(s[1])))
             used.append(style)
         colour, dash = style
-        label = f"{solver} ({solvers[:i].count(solver)})" if solver in solvers[:i] else solver
+        label = f"{name} ({names[:i].count(name)})" if name in names[:i] else name
         styles.append({"label": label, "color": colour, "linestyle": dash, "zorder": 3.0 if dash == "-" else 3.5})
     return styles
 
@@ -114,13 +117,17 @@ def path_figure(logs: Sequence[Log], styles: Sequence[dict[str, Any]]) -> Figure
             ax.plot(x, y, color=PLANNED_COLOUR, linewidth=4.0, zorder=2, label="planned path")
             ax.plot(x[-1:], y[-1:], "k*", markersize=9, zorder=4, label="goal")
             for log, style in zip(logs, styles, strict=True):
-                ax.plot(log.tool[:, k, horizontal], log.tool[:, k, vertical], linewidth=1.7, **style)
+                x, y = log.tool[:, k, horizontal], log.tool[:, k, vertical]
+                ax.plot(x, y, linewidth=1.7, **style)
+                for steps in spans(log.planned):
+                    _mark_plan(ax, x, y, *steps, log.t)
         ax.autoscale_view()
         add_grid(ax)
         ax.set_aspect("equal", adjustable="datalim")
         ax.set_ylabel(f"{'xyz'[vertical]} [m]")
     axes[1].set_xlabel(f"{'xyz'[horizontal]} [m]")
-    handles: dict[str, Any] = {str(line.get_label()): line for line in axes[0].get_lines()}
+    named = [line for line in axes[0].get_lines() if not str(line.get_label()).startswith("_")]
+    handles: dict[str, Any] = {str(line.get_label()): line for line in named}
     for i, described in enumerate(longest.meta["obstacles"]):
         path, colour = obstacle_path(longest, i), _colour(i)
         if is_endless(longest, i) or not len(path):
@@ -133,6 +140,15 @@ def path_figure(logs: Sequence[Log], styles: Sequence[dict[str, Any]]) -> Figure
     add_legend(axes[0], list(handles.values()))
     figure.suptitle(f"{longest.meta['title'] or longest.meta['scenario']}  —  tool path", fontsize=11)
     return figure
+
+
+def _mark_plan(ax: Any, x: Array, y: Array, first: int, last: int, t: Array) -> None:
+    """Draw the part of a tool's path on which a plan was followed, with the times of its ends [s]."""
+    label, part = "plan followed, between its times", slice(first, last + 1)
+    ax.plot(x[part], y[part], color=PLAN, linewidth=5.0, alpha=0.45, zorder=2.5, label=label)
+    for step, marker in ((first, "v"), (last, "^")):
+        ax.plot(x[step], y[step], color=PLAN, marker=marker, markersize=7, zorder=5)
+        ax.annotate(f"{t[step]:.2f} s", (x[step], y[step]), (6, 6), textcoords="offset points", fontsize=8, color=PLAN)
 
 
 def _colour(obstacle: int) -> tuple[float, ...]:

@@ -23,12 +23,15 @@ from qpavoid.viz.style import (
     COLLISION,
     COLOURS,
     DASHES,
+    PLAN,
     add_grid,
     add_legend,
     draw_levels,
     label_distances,
+    spans,
     units,
 )
+from qpavoid.viz.torque_figures import panels_figure, torque_figures
 
 __all__ = ["plot_compare", "plot_run", "sight_of"]
 DPI = 130
@@ -43,7 +46,7 @@ _MAX_NAMED_LINES = 2 * len(COLOURS)
 
 
 def plot_run(log: Log, folder: str | Path, sight: Sight | None = None) -> list[Path]:
-    """Write the figures of one run: motion, joints, distances, speeds.
+    """Write the figures of one run: motion, joints, distances, speeds, and of one with motors torques and contacts.
 
     Args:
         log: the run.
@@ -55,6 +58,7 @@ def plot_run(log: Log, folder: str | Path, sight: Sight | None = None) -> list[P
     """
     draw = {"joints": joints_figure, "distances": distances_figure, "speeds": speeds_figure}
     figures = {"motion": motion_figure(log, sight), **{name: make(log) for name, make in draw.items()}}
+    figures |= torque_figures(log)
     for figure in figures.values():
         figure.suptitle(_title(log), fontsize=11)
     return _save(figures, folder, f"{log.meta['scenario']}_{log.meta['solver'].replace(':', '-')}")
@@ -94,32 +98,9 @@ def _title(log: Log) -> str:
 
 def joints_figure(log: Log) -> Figure:
     """Draw q over time, a panel each, with position limits (Figs. 7, 14 of the paper)."""
-    names = log.meta["positions"]
     limits = {name: (lower, upper) for name, lower, upper in log.meta["position_limits"]}
-    columns = 4 if len(names) <= 16 else 6
-    rows = max(-(-len(names) // columns), 1)
-    figure = Figure(figsize=(2.6 * columns, 1.8 * rows + 0.8), layout="constrained")
-    for i, name in enumerate(names):
-        ax = figure.add_subplot(rows, columns, i + 1)
-        ax.plot(log.t, log.q[:, i], color=COLOURS[0], linewidth=1.4)
-        ax.set_title(name, fontsize=9)
-        ax.tick_params(labelsize=8)
-        add_grid(ax)
-        finite = [limit for limit in limits.get(name, ()) if np.isfinite(limit)]
-        for limit in finite:
-            ax.axhline(limit, color=COLLISION, linewidth=0.8)
-        bottom, top = ax.get_ylim()
-        for limit in finite:
-            outer = bottom if limit == limits[name][0] else top
-            ax.axhspan(limit, outer, color=COLLISION, alpha=0.15, linewidth=0)
-        ax.set_ylim(bottom, top)
-        if i + columns >= len(names):
-            ax.set_xlabel("time [s]", fontsize=9)
-    figure.supylabel(f"joint position [{units(log)}]", fontsize=10)
-    beyond = Patch(color=COLLISION, alpha=0.3, label="beyond limits")
-    handles = [Line2D([], [], color=COLOURS[0], label="position"), beyond]
-    figure.legend(handles=handles, loc="outside lower center", ncols=2, fontsize=9, frameon=False)
-    return figure
+    names = log.meta["positions"]
+    return panels_figure(log.t, log.q, names, [limits.get(name, ()) for name in names], "joint position", units(log))
 
 
 def _draw_lines(
@@ -236,15 +217,18 @@ def speeds_figure(log: Log) -> Figure:
 
 
 def _shade_status(ax: Any, log: Log) -> list[Any]:
-    """Shade steps that were relaxed or stopped; return their legend entries."""
+    """Shade steps that were relaxed or stopped, and mark those of a plan; return their legend entries."""
     handles = []
     dt = log.meta["config"]["dt"]
     for status, colour in _STATUS_COLOUR.items():
-        bad = np.r_[False, log.status == STATUSES.index(status), False].astype(np.int8)
-        starts, ends = np.flatnonzero(np.diff(bad) == 1), np.flatnonzero(np.diff(bad) == -1)
-        for start, end in zip(starts, ends, strict=True):
-            ax.axvspan(log.t[start], log.t[end - 1] + dt, color=colour, alpha=0.35, linewidth=0, zorder=0)
-        if len(starts):
+        bad = log.status == STATUSES.index(status)
+        for start, end in spans(bad):
+            ax.axvspan(log.t[start], log.t[end] + dt, color=colour, alpha=0.35, linewidth=0, zorder=0)
+        if bad.any():
             count = int(bad.sum())
             handles.append(Patch(color=colour, alpha=0.35, label=f"{status.value}: {count} step{'s' * (count > 1)}"))
+    for start, end in spans(log.planned):
+        ax.axvspan(log.t[start], log.t[end] + dt, color=PLAN, alpha=0.15, linewidth=0, zorder=0)
+    if log.planned.any():
+        handles.append(Patch(color=PLAN, alpha=0.15, label=f"plan followed: {dt * log.planned.sum():.1f} s"))
     return handles

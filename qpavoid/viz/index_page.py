@@ -64,7 +64,8 @@ def _section(logs: Sequence[Log], pictures: Sequence[str]) -> str:
         solver = str(log.meta["solver"])
         stem = f"{name}_{solver.replace(':', '-')}"
         figures = "".join(
-            _image(f"{stem}_{figure}.png", pictures) for figure in ("motion", "distances", "speeds", "joints")
+            _image(f"{stem}_{figure}.png", pictures)
+            for figure in ("motion", "distances", "speeds", "joints", "torques", "contacts")
         )
         lines = "".join(f"<li>{escape(line)}</li>" for line in events(run))
         is_open = " open" * (log is logs[-1])

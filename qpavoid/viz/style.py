@@ -25,6 +25,8 @@ DASHES: tuple[Any, ...] = (
 COLLISION, D1, D2 = "#C62F2F", "#7A4B9A", "#8A8A8A"
 OBSTACLES = ((0.90, 0.42, 0.25), (0.90, 0.62, 0.10), (0.70, 0.45, 0.75), (0.35, 0.62, 0.45), (0.55, 0.55, 0.60))
 """Colours of obstacles, in turn."""
+PLAN = "#1A9E9E"
+"""Colour of what is of a plan that is followed."""
 MOVING, AT_REST, GROUND, TOOL_PATH = "#6BA3D6", "#C4C4C4", "#EFE3C8", "#007A56"
 
 
@@ -42,6 +44,13 @@ def distance_colours(d: Array, d1: float, d2: float) -> Array:
 def units(log: Log, per: str = "") -> str:
     """Return the unit of the coordinates, `rad`, `m`, or `rad or m` where a robot has both, `per` behind each."""
     return " or ".join(unit + per for unit in ("rad", "m") if unit in log.meta["units"])
+
+
+def spans(flags: Any) -> list[tuple[int, int]]:
+    """Return the first step and the last one of each span in which a flag (N,) is set."""
+    edges = np.diff(np.r_[False, flags, False].astype(np.int8))
+    starts, ends = np.flatnonzero(edges == 1), np.flatnonzero(edges == -1) - 1
+    return list(zip(starts.tolist(), ends.tolist(), strict=True))
 
 
 def add_grid(ax: Any) -> None:

@@ -1,6 +1,6 @@
-"""Independent checker: run commanded velocities in MuJoCo and look for contacts.
+"""Independent checker: run commanded velocities in MuJoCo and look for contacts, at the control steps and between them.
 
-It looks at the control steps and between them.
+A robot that was simulated with its dynamics is placed where it was, at its control steps.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ class Findings:
     contacts: tuple[Contact, ...]
     """Pairs that touched, in the order of time."""
     q: Array
-    """(N, nq) configurations at the steps, by MuJoCo's integration."""
+    """(N, nq) configurations at the steps, by MuJoCo."""
     nearest: Array
     """(N,) smallest distance of the pairs that the robot can move, at the steps [m]: exact where below
     `measured_below`, elsewhere a lower bound that is not below it."""
@@ -135,7 +135,9 @@ class DistanceMonitor:
         return np.asarray(np.sqrt(np.square(center - old_center).sum(axis=1)) + self._radius * turn)
 
 
-def check_run(model: MujocoModel, t: Array, v: Array, limits: Limits, measured_below: float = -np.inf) -> Findings:
+def check_run(
+    model: MujocoModel, t: Array, v: Array, limits: Limits, measured_below: float = -np.inf, q: Array | None = None
+) -> Findings:
     """Run velocities from the start of the model, each until the next step, and check them.
 
     Args:
@@ -144,15 +146,21 @@ def check_run(model: MujocoModel, t: Array, v: Array, limits: Limits, measured_b
         v: velocities commanded at them (N, nv) [rad/s or m/s].
         limits: use of the joint limits, against which velocities are held.
         measured_below: distances below it are measured at every tick [m].
+        q: configurations (N, nq) at the ticks, of a robot that has not followed v exactly; nothing is checked between
+            them.
     """
-    q, nearest = np.empty((len(t), len(model.q0))), np.empty(len(t))
+    known, q, nearest = q, np.empty((len(t), len(model.q0))), np.empty(len(t))
     model.place(model.q0, t[0])
     monitor = DistanceMonitor(model, measured_below=measured_below)
     monitor.measure(t[0])
     q_now = model.q0
     for k, now in enumerate(t.tolist()):
         q[k], nearest[k] = q_now, monitor.nearest
-        if k + 1 < len(t):
+        if k + 1 < len(t) and known is not None:
+            q_now = known[k + 1]
+            model.place(q_now, t[k + 1])
+            monitor.measure(t[k + 1])
+        elif k + 1 < len(t):
             q_now = monitor.follow(q_now, v[k], now, float(t[k + 1]) - now)
     bounds = model.scene.robot.bounds().within(limits)
     acceleration = np.diff(v, axis=0, prepend=0.0) / np.diff(t, append=2.0 * t[-1] - t[-2])[:, None]

@@ -21,10 +21,12 @@ from qpavoid_bench.adapters import adapters
 from qpavoid_bench.camera import camera
 from qpavoid_bench.endurance.command import endurance
 from qpavoid_bench.grasps.command import grasps
+from qpavoid_bench.planning import planning
 from qpavoid_bench.serve import serve
 from qpavoid_bench.solvers.command import solvers
 from qpavoid_bench.survey import robots
 from qpavoid_bench.tick.command import tick
+from qpavoid_bench.torque_steps import dynamics
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -49,7 +51,11 @@ app.command()(serve)
 app.command()(camera)
 app.command()(adapters)
 app.command()(grasps)
-_MEASURES = ("tick", "solvers", "endurance", "robots", "grasps", "serve", "camera", "adapters")
+app.command()(dynamics)
+app.command()(planning)
+_MEASURES = (
+    "tick", "solvers", "endurance", "robots", "grasps", "serve", "camera", "adapters", "dynamics", "planning",
+)  # fmt: skip
 """Commands that need none of the packages below."""
 
 _PACKAGES = ("distributed", "mujoco", "pandas", "statsmodels", "matplotlib")

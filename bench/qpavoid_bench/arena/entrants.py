@@ -86,8 +86,10 @@ def _start_solver(solver: SolverConfig, changes: Mapping[str, Mapping[str, Any]]
     for block, fields in changes.items():
         scenario[block] = {**(scenario[block] or {}), **fields}
     x = ScenarioConfig.model_validate({**scenario, "solver": solver.model_dump()})
-    blocks = x.avoidance, x.limits, x.sensing, x.progress
-    return Controller(world.scene, world.tasks, make_solver(x.solver), x.dt, *blocks, planning=x.planning)
+    blocks = x.avoidance, x.limits, x.sensing, x.progress, world.contacts
+    return Controller(
+        world.scene, world.tasks, make_solver(x.solver), x.dt, *blocks, planning=x.planning, dynamics=x.dynamics
+    )
 
 
 def _library_entrant(library: Library) -> Entrant:

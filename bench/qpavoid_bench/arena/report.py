@@ -21,11 +21,11 @@ from qpavoid_bench.arena.statistics import CONFIDENCE, duel, mean
 from qpavoid_bench.arena.store import read_facts, read_failures, read_runs
 from qpavoid_bench.arena.suite import describe_entrants
 from qpavoid_bench.arena.tables import (
-    COLUMNS,
-    MORE,
     better_than,
     code,
     escape,
+    groups_of,
+    has_motors,
     interval_text,
     markdown_table,
     score_tables,
@@ -49,8 +49,13 @@ COMPARISON_LIMITS = (
     "Not measured: drives, dynamics and forces; sensors, beyond the delay and noise of a family that says so; memory, "
     "and the time to set up; what a tick that comes late would do, for here every velocity is there in time.",
 )
-
-
+MOTORS_LIMITS = (
+    "Robots have torque motors in MuJoCo, with masses, friction and delays that the controller does not know. "
+    "Distances and contacts are MuJoCo's where the robot was at its control steps; obstacles push nothing. Of a law "
+    "without bounds, the velocity is approached at the tracking rate, and its inverse dynamics are commanded, cut at "
+    "their limits; of a robot that stands, the nearest velocity that torques and friction cones allow."
+)
+"""What holds in place of the first of these where robots have motors."""
 _MAX_ROWS = 3
 """Worst runs, and failures, that are listed of each entrant."""
 _MAX_SEEDS_SHOWN = 5
@@ -110,9 +115,9 @@ def report_lines(results: Results, facts: Mapping[str, Any], folder: Path = Path
     """
     sections = {
         "What this was made on": [f"- {point}" for point in _provenance(results, facts)],
-        "Limits of the comparison": [f"- {point}" for point in COMPARISON_LIMITS],
+        "Limits of the comparison": [f"- {point}" for point in _limits(results)],
         "Who takes part": _entrants(results, facts),
-        "How it is scored": _definitions(),
+        "How it is scored": _definitions(results),
         "Overall": [*(f"![{caption}](report-{name}.png)\n" for _, name, caption in _FIGURES), *score_tables(results)],
         "Beside the best": _beside_the_best(results),
         **({"Where others are better than qp": better_than(results, "qp")} if "qp" in results.entrants else {}),
@@ -122,6 +127,11 @@ def report_lines(results: Results, facts: Mapping[str, Any], folder: Path = Path
     }
     for title, lines in sections.items():
         yield from (f"## {title}", "", *lines, "")
+
+
+def _limits(results: Results) -> tuple[str, ...]:
+    """Return what the comparison does not tell."""
+    return (MOTORS_LIMITS, *COMPARISON_LIMITS[1:3]) if has_motors(results) else COMPARISON_LIMITS
 
 
 def _provenance(results: Results, facts: Mapping[str, Any]) -> Iterator[str]:
@@ -182,7 +192,7 @@ def _entrants(results: Results, facts: Mapping[str, Any]) -> list[str]:
     return markdown_table(("entrant", "what it is", "its own settings"), rows)
 
 
-def _definitions() -> list[str]:
+def _definitions(results: Results) -> list[str]:
     """Define the figures and the ranking."""
     return [
         f"Ranges with figures hold the true value with {100 * CONFIDENCE:.0f} % over further seeds: of rates that of "
@@ -195,7 +205,7 @@ def _definitions() -> list[str]:
         "",
         *markdown_table(
             ("figure", "what it is"),
-            [(escape(column.heading), escape(column.description)) for column in (*COLUMNS, *MORE)],
+            [(escape(column.heading), escape(column.description)) for group in groups_of(results) for column in group],
         ),
     ]
 

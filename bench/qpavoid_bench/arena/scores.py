@@ -83,7 +83,8 @@ class Score:
     jitter: float
     """Σ|Δq̇| over joints and ticks, per second [rad/s² or m/s²]."""
     frozen: float
-    """Fraction of the time with all tools at rest and a target away that is in reach, whatever is in the way [-]."""
+    """Fraction of the time with all tools at rest and a target away that is in reach, whatever is in the way; 0 of a
+    robot whose base floats, of whose reach nothing is known [-]."""
     lurch: float
     """Largest Σ|Δq̇| of a step over joints, from rest [rad/s or m/s]."""
     chatter: float
@@ -91,7 +92,16 @@ class Score:
     peak_velocity: float
     """Largest velocity of a joint, over its limit [-]."""
     violations: float
-    """Fraction of steps that exceed a velocity, position, acceleration or jerk limit [-]."""
+    """Fraction of steps that exceed a velocity, position, acceleration or jerk limit; of a plant, one of velocity,
+    position or torque [-]."""
+    torque: float
+    """Largest commanded torque over its limit; 0 where velocities are followed, as the three below [-]."""
+    torque_jitter: float
+    """Σ|Δτ| over motors and ticks, per second [Nm/s or N/s]."""
+    slip: float
+    """Largest way of a contact point along the floor [m]."""
+    fallen: float
+    """Share of the duration after the robot fell [-]."""
     relaxed: float
     """Fraction of steps whose constraints were relaxed [-]."""
     stopped: float
@@ -157,7 +167,7 @@ def score(
         settings=settings,
         version=version("qpavoid"),
         reachable=case.reachable,
-        success=not findings.contacts and (arrived if case.reachable else rests),
+        success=not findings.contacts and not rollout.fallen and (arrived if case.reachable else rests),
         collided=bool(findings.contacts),
         avoidable=bool(findings.contacts),
         verdict="",
@@ -179,6 +189,10 @@ def score(
         chatter=float(np.abs(change[-round(CHATTER_TIME / scenario.dt) :]).sum(axis=1).mean()) if ticks > 1 else 0.0,
         peak_velocity=float(np.max(np.abs(rollout.v) / limit, initial=0.0)),
         violations=float(np.mean(_violates_limits(world, scenario, rollout, findings))),
+        torque=float(np.max(np.abs(rollout.torque) / rollout.torque_limit, initial=0.0)),
+        torque_jitter=float(np.abs(np.diff(rollout.torque, axis=0)).sum()) / (scenario.dt * ticks),
+        slip=rollout.slip,
+        fallen=rollout.fallen,
         relaxed=_status_fraction(rollout, Status.RELAXED),
         stopped=_status_fraction(rollout, Status.STOPPED),
         failed=float(np.mean(rollout.failed)),
@@ -199,7 +213,8 @@ def _frozen_fraction(case: Case, world: World, rollout: Rollout) -> float:
     speed = np.linalg.norm(np.diff(rollout.tool, axis=0), axis=2).max(axis=1, initial=0.0) / dt
     away = np.linalg.norm(rollout.target - rollout.tool, axis=2) > case.scenario.goal_tolerance
     at_rest = np.append(speed < REST_SPEED, False)
-    if not (at_rest[:, None] & away).any():
+    is_floating = world.contacts is not None
+    if is_floating or not (at_rest[:, None] & away).any():
         return 0.0
     every, robot = max(1, round(_REACH_PERIOD / dt)), world.scene.robot
     points = np.round(rollout.target[::every], 3)
@@ -224,11 +239,14 @@ def _violates_limits(world: World, scenario: ScenarioConfig, rollout: Rollout, f
     """Return for each step (N,) whether it exceeds a limit by more than round-off."""
     bounds = world.scene.robot.bounds().within(scenario.limits)
     q = findings.q[:, bounds.q_index]
+    passed = (np.abs(rollout.v) > bounds.velocity + _ROUND_OFF).any(axis=1)
+    passed |= ((q < bounds.lower - _ROUND_OFF) | (q > bounds.upper + _ROUND_OFF)).any(axis=1)
+    if scenario.plant is not None:
+        return np.asarray(passed | (np.abs(rollout.torque) > rollout.torque_limit + _ROUND_OFF).any(axis=1))
     acceleration = np.diff(rollout.v, axis=0, prepend=0.0) / scenario.dt
     jerk = np.diff(acceleration, axis=0, prepend=0.0) / scenario.dt
     return np.asarray(
-        (np.abs(rollout.v) > bounds.velocity + _ROUND_OFF).any(axis=1)
-        | ((q < bounds.lower - _ROUND_OFF) | (q > bounds.upper + _ROUND_OFF)).any(axis=1)
+        passed
         | (np.abs(acceleration) > bounds.acceleration + _ROUND_OFF / scenario.dt).any(axis=1)
         | (np.abs(jerk) > bounds.jerk + _ROUND_OFF / scenario.dt**2).any(axis=1)
     )

@@ -63,9 +63,25 @@ MORE = (
     Column("stopped", "stopped [%]", 100.0, 1, "mean", "ticks in which the robot was braked or held"),
     Column("failed", "failed [%]", 100.0, 2, "mean", "ticks in which the entrant raised or gave no finite velocity"),
 )  # fmt: skip
-
+MOTORS = (
+    Column("torque", "torque [%]", 100.0, 0, "mean", "largest commanded one, over its limit"),
+    Column("torque_jitter", "torque jitter [Nm/s]", 1.0, 0, "median", "Σ|Δτ| over motors and ticks, per second"),
+    Column("slip", "slip [mm]", 1e3, 2, "mean", "largest way of a contact point along the floor"),
+    Column("fallen", "fallen [%]", 100.0, 0, "mean", "share of the duration after the robot fell"),
+)
+"""Figures of robots with motors."""
 
 _ESTIMATES: dict[str, Callable[[Array], Interval]] = {"rate": rate, "mean": mean, "median": median}
+
+
+def has_motors(results: Results) -> bool:
+    """Return True if robots with motors are among the runs."""
+    return bool(results.runs["torque"].max() > 0.0)
+
+
+def groups_of(results: Results) -> tuple[tuple[Column, ...], ...]:
+    """Return the groups of figures that the runs have."""
+    return (COLUMNS, MORE, MOTORS) if has_motors(results) else (COLUMNS, MORE)
 
 
 def score_tables(results: Results, family: str | None = None) -> list[str]:
@@ -75,7 +91,7 @@ def score_tables(results: Results, family: str | None = None) -> list[str]:
     """
     place = results.ranking(family)
     lines = []
-    for group in (COLUMNS, MORE):
+    for group in groups_of(results):
         columns = [column for column in group if not results.runs[column.name].isna().all()]
         tables = [results.table(column.name, family) for column in columns]
         rows = []

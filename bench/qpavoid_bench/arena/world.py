@@ -7,6 +7,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from qpavoid import build_contacts
 from qpavoid.config import ScenarioConfig
 from qpavoid.control.tasks import FrameTask, RowTask, build_tasks
 from qpavoid.errors import ConfigError, located
@@ -22,6 +23,8 @@ class World(NamedTuple):
     tasks: tuple[RowTask, ...]
     q0: Array
     """(nq,) configuration at the start."""
+    contacts: Any = None
+    """Frames that rest, of a robot that stands, see `qpavoid.build_contacts`; None of others."""
 
     @property
     def tools(self) -> list[FrameTask]:
@@ -59,13 +62,18 @@ def build_world(scenario: ScenarioConfig) -> World:
         ConfigError, UnknownName: naming file, field and remedy.
     """
     source = scenario.source
-    if scenario.contacts or any(obstacle.attached_to for obstacle in scenario.obstacles):
-        raise ConfigError(f"{source}: the arena knows neither contacts nor obstacles that are carried; leave them out")
+    if any(obstacle.attached_to for obstacle in scenario.obstacles):
+        raise ConfigError(f"{source}: the arena knows no obstacles that are carried; leave them out")
+    if scenario.contacts and scenario.plant is None:
+        raise ConfigError(f"{source}: contacts are checked on a plant; give `dynamics` and `plant`, or leave them out")
+    if scenario.dynamics and scenario.plant is None:
+        raise ConfigError(f"{source}: torques need something that they move; give `plant`, or leave `dynamics` out")
     robot, q0 = load_robot(scenario.robot, scenario.q0, scenario.lock, source)
     obstacles = build_obstacles(scenario.obstacles, source)
     with located(str(source)):
         scene = build_scene(robot, obstacles)
-    return World(scene, tuple(build_tasks(scenario.tasks, robot, q0, source)), q0)
+    contacts = build_contacts(scenario.contacts, robot, q0, source)
+    return World(scene, tuple(build_tasks(scenario.tasks, robot, q0, source)), q0, contacts)
 
 
 def surface_safety_distance(scenario: ScenarioConfig) -> float:

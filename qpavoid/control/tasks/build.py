@@ -14,6 +14,7 @@ from qpavoid.control.tasks.base import RowTask
 from qpavoid.control.tasks.com import Com
 from qpavoid.control.tasks.frame import FrameTask
 from qpavoid.control.tasks.manipulability import Manipulability
+from qpavoid.control.tasks.momentum import Momentum
 from qpavoid.control.tasks.posture import Damping, Posture
 from qpavoid.control.tasks.relative import Relative
 from qpavoid.control.tasks.start import Start
@@ -24,6 +25,7 @@ _KINDS: dict[type[config.TaskBlock], Callable[[Any, Start], RowTask]] = {
     config.Task: FrameTask,
     config.RelativeTask: Relative,
     config.ComTask: Com,
+    config.MomentumTask: Momentum,
     config.PostureTask: Posture,
     config.DampingTask: Damping,
     config.LookAtTask: Axis,

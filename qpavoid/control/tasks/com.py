@@ -28,7 +28,7 @@ class Com(RowTask):
     def write_rows(self, q: Array, kinematics: ForwardKinematics, target: Any, A: Array, b: Array) -> float:
         """See `RowTask.write_rows`."""
         n = self.rows
-        center, J = kinematics.center_of_mass()
+        center, J = kinematics.center_of_mass(q)
         error = (target.position - center)[:n]
         self._scale_into(A, b, J[:n], target.linear[:n] + self._gain * error)
         return length(error)

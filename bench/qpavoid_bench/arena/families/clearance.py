@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cached_property
+
 import numpy as np
 
 from qpavoid.control.distances import DistanceQuery
@@ -43,11 +45,16 @@ class Clearance:
         """Whether an obstacle moves."""
         self._fixed = ~np.any(scene.support != 0.0, axis=1)
         self._duration = duration
-        self.speed = self._max_obstacle_speed()
+        self._robot, self.speed = scene.robot, self._max_obstacle_speed()
         """Largest speed of any point of an obstacle [m/s]."""
-        self.lever_arm = self._lever_arms(JointRanges.of(scene.robot))
-        """(nv,) bound on the travel of any point of the robot per unit of each coordinate [m/rad or 1]. A joint
-        moves one body of a pair, or both as one: no distance changes by more than lever_arm @ |Δq|."""
+
+    @cached_property
+    def lever_arm(self) -> Array:
+        """(nv,) bound on the travel of any point of the robot per unit of each coordinate [m/rad or 1].
+
+        A joint moves one body of a pair, or both as one: no distance changes by more than lever_arm @ |Δq|.
+        """
+        return self._lever_arms(JointRanges.of(self._robot))
 
     def at(self, q: Array, t: float) -> float:
         """Return the smallest distance of any pair [m], up to 0.1 m above the required one."""
@@ -79,10 +86,16 @@ class Clearance:
         that the margin of the smallest one bounds the next advance. Samples are at least `MIN_ADVANCE` apart, and each
         needs half as much beyond the required distance: between two samples no distance falls below the required one.
         """
-        if not self.is_clear(b, tb):
-            return False
-        dq, fraction = b - a, 0.0
-        change = float(self.lever_arm @ np.abs(dq)) + self.speed * (tb - ta)
+        dq = b - a
+        return self.is_clear(b, tb) and self._is_clear_along(a, dq, ta, tb, float(self.lever_arm @ np.abs(dq)))
+
+    def stays_clear(self, q: Array) -> bool:
+        """Return True if all pairs of a robot that rests at q (nq,) are clear all the time."""
+        return self.is_clear(q, self._duration) and self._is_clear_along(q, 0.0 * q, 0.0, self._duration, 0.0)
+
+    def _is_clear_along(self, a: Array, dq: Array, ta: float, tb: float, travel: float) -> bool:
+        """Return True if all pairs are clear from a at ta to a + dq at tb, on which points travel so far [m]."""
+        change, fraction = travel + self.speed * (tb - ta), 0.0
         while fraction < 1.0:
             margin = self.at(a + fraction * dq, ta + fraction * (tb - ta)) - self.least
             if margin < 0.0:

@@ -76,7 +76,7 @@ class FamilyConfig(Block):
     proved: bool = True
     """Whether a solution is proved to exist; where not, each contact is judged avoidable or not (`arena.verdict`)."""
     static: bool = False
-    """Whether nothing moves but the target, so that standing still avoids every contact; no solution is looked for."""
+    """Whether a robot that stays where it starts touches nothing, which is proved in place of a way to the goals."""
     starts_clear: bool = True
     """Whether everything is farther apart than d1 at the start."""
 

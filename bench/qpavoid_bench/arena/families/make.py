@@ -18,8 +18,6 @@ from qpavoid_bench.arena.world import World, build_world, load_robot
 
 MAX_DRAWS = 100
 """Largest number of draws of a seed before the family is refused."""
-_STAY = "nothing moves: the robot can stay where it starts"
-"""Why contacts of a static family are avoidable."""
 _DIGITS = 9
 """Decimals that numbers of a scenario keep: machines round differently in the last ones."""
 
@@ -50,8 +48,8 @@ def make_case(family: Family, seed: int) -> Case:
             random = np.random.default_rng([seed, number])
             how = "it starts below d1, and is to get out" if not config.starts_clear else ""
             if config.starts_clear:
-                provable = config.reachable if config.proved and not config.static else None
-                how = solved_by(scenario, world, provable, random) or _STAY * config.static
+                provable = config.reachable if config.proved else None
+                how = solved_by(scenario, world, provable, random, config.static)
         except Redraw as reason:
             causes.append(str(reason))
             continue

@@ -25,7 +25,13 @@ _SPEED_FRACTION, _MAX_SPEED = 0.5, 1.5
 """Fraction of the joints' speed limits that plans use [-], and their largest speed [rad/s or m/s]."""
 
 
-def solved_by(scenario: ScenarioConfig, world: World, reachable: bool | None, random: np.random.Generator) -> str:
+STAYS = "the robot can stay where it starts"
+"""Why contacts of a static family are avoidable."""
+
+
+def solved_by(
+    scenario: ScenarioConfig, world: World, reachable: bool | None, random: np.random.Generator, stays: bool = False
+) -> str:
     """Describe the proof that a scenario is as intended.
 
     Args:
@@ -33,6 +39,7 @@ def solved_by(scenario: ScenarioConfig, world: World, reachable: bool | None, ra
         world: of the same.
         reachable: whether its goals are meant to be reached; None: that is not to be proved, and the answer is empty.
         random: where samples come from.
+        stays: whether it is proved that nothing touches the robot where it starts, in place of a way to the goals.
 
     Raises:
         ConfigError: no task is that of a frame with a position.
@@ -45,6 +52,10 @@ def solved_by(scenario: ScenarioConfig, world: World, reachable: bool | None, ra
         raise Redraw("the start is too near to something")
     if not clearance.immovable_pairs_are_clear(world.q0):
         raise Redraw("an obstacle comes too near to what cannot move")
+    if stays:
+        if not clearance.stays_clear(world.q0):
+            raise Redraw("an obstacle comes too near to where the robot starts")
+        return STAYS
     if reachable is None:
         return ""
     if reachable:
@@ -87,8 +98,6 @@ def _goals(
     random: np.random.Generator,
 ) -> Array:
     """Find configurations (g, nv) at the final targets, clear from `t_from` [s] on.
-
-    Those near the start come first.
 
     Those near the start come first.
     """

@@ -1,0 +1,94 @@
+"""Whether what is comes as it was forecast: comparisons of each control step, with memory of none."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from qpavoid.kernels.packing import compiled
+from qpavoid.problem import Array, IntArray
+
+
+@compiled
+def largest_part(parts: Array) -> float:
+    """Return the largest norm of vectors of three, one after the other (3 k,)."""
+    largest = 0.0
+    for k in range(0, len(parts), 3):
+        largest = max(largest, parts[k] ** 2 + parts[k + 1] ** 2 + parts[k + 2] ** 2)
+    return float(np.sqrt(largest))
+
+
+@compiled
+def strays(
+    q: Array, errors: Array, t: float, times: Array, forecast_q: Array, forecast_errors: Array, moved: float,
+    turned: float,
+) -> bool:  # fmt: skip
+    """Return whether the robot, or an error of its frames, is elsewhere than in a forecast of n steps.
+
+    Args:
+        q: where it is (nq,).
+        errors: of the frames (3 k,) [m, rad].
+        t: now [s].
+        times: of the forecast (n,), evenly spaced [s].
+        forecast_q: (n, nq).
+        forecast_errors: (n,) largest errors [m, rad].
+        moved: difference of the largest error that does not count [m, rad].
+        turned: the same of a joint [rad, m].
+    """
+    last, step = len(times) - 1, 0
+    if last > 0:
+        step = min(max(int(np.round((t - times[0]) / (times[last] - times[0]) * last)), 0), last)
+    if abs(largest_part(errors) - forecast_errors[step]) > moved:
+        return True
+    farthest = 0.0
+    for i in range(len(q)):
+        farthest = max(farthest, abs(q[i] - forecast_q[step, i]))
+    return farthest > turned
+
+
+@compiled
+def any_moves(states: Array, which: IntArray) -> bool:
+    """Return whether any of some obstacles has a velocity, of states (o, 18)."""
+    for i in which:
+        for c in range(12, 18):
+            if states[i, c] != 0.0:
+                return True
+    return False
+
+
+@compiled
+def any_displaced(states: Array, which: IntArray, earlier: Array, moved: float, turned: float) -> bool:
+    """Return whether any of k obstacles is elsewhere than before.
+
+    Args:
+        states: of all obstacles (o, 18).
+        which: their numbers (k,).
+        earlier: their states before (k, 18).
+        moved: difference of a coordinate that does not count [m].
+        turned: the same of an element of the rotation [-].
+    """
+    for k in range(len(which)):
+        for c in range(12):
+            if abs(states[which[k], c] - earlier[k, c]) > (turned if c < 9 else moved):
+                return True
+    return False
+
+
+@compiled
+def surprise(states: Array, which: IntArray, earlier: Array, dt: float) -> float:
+    """Return the largest square of what positions differ from those that twists led to [m²].
+
+    Args:
+        states: of all obstacles (o, 18).
+        which: numbers of k of them (k,).
+        earlier: their states dt before (k, 18); brought up to date.
+        dt: [s].
+    """
+    worst = 0.0
+    for k in range(len(which)):
+        square = 0.0
+        for c in range(9, 12):
+            square += (states[which[k], c] - earlier[k, c] - dt * earlier[k, c + 3]) ** 2
+        worst = max(worst, square)
+        for c in range(18):
+            earlier[k, c] = states[which[k], c]
+    return worst
