@@ -32,7 +32,7 @@ from qpavoid.model.scene import Obstacle, Scene
 from qpavoid.planning.replanning import Replanning
 from qpavoid.problem import Array, Solution, State, as_vector, require_finite
 from qpavoid.safety.arbiter import Arbiter
-from qpavoid.solvers import Solver, check_solver, make_solver
+from qpavoid.solvers import Solver, as_solver, check_solver, make_solver
 from qpavoid.solvers.solver import NamedSolver
 
 _MAX_DT = 1.0
@@ -47,7 +47,7 @@ class Controller(SceneChanges, SplitStep):
         self,
         scene: Scene,
         tasks: Sequence[RowTask],
-        solver: Solver | str = "qp",
+        solver: Solver | Mapping[str, Any] | str = "qp",
         dt: float = 0.01,
         avoidance: Avoidance | None = None,
         limits: Limits | None = None,
@@ -64,7 +64,7 @@ class Controller(SceneChanges, SplitStep):
         Args:
             scene: robot and obstacles.
             tasks: what to follow; see `build_tasks`. None are needed for `filter`.
-            solver: a `Solver`, or a name such as `eq10` or `qp:proxqp`.
+            solver: a `Solver`, a name such as `eq10` or `qp:proxqp`, or a mapping as in a scenario file.
             dt: control period [s]: each velocity is meant to be held that long.
             avoidance: distances and rows; the defaults of a scenario if left out.
             limits: use of the joint limits; the defaults of a scenario if left out.
@@ -97,7 +97,7 @@ class Controller(SceneChanges, SplitStep):
         self.dt = dt
         self.tasks: tuple[RowTask, ...] = (*frames, *others)
         """Frames with a position to follow, then with an orientation alone, then all other tasks."""
-        law, self.has_contacts = make_solver(solver) if isinstance(solver, str) else solver, contacts is not None
+        law, self.has_contacts = as_solver(solver), contacts is not None
         check_solver(law, self.has_contacts and dynamics is None)
         self.limits, self._v_shape = limits or Limits(), (scene.robot.model.nv,)
         self.avoidance, self._no_backup = within_contacts(avoidance or Avoidance(), self.has_contacts, bool(dynamics))
@@ -131,8 +131,8 @@ class Controller(SceneChanges, SplitStep):
         return self._arbiter.solver
 
     @solver.setter
-    def solver(self, law: Solver) -> None:
-        check_solver(law, self.has_contacts and self._builder.rows.dynamics is None)
+    def solver(self, solver: Solver | Mapping[str, Any] | str) -> None:
+        check_solver(law := as_solver(solver), self.has_contacts and self._builder.rows.dynamics is None)
         self._arbiter.solver = law
         self._builder.rows.adapt(law, self.avoidance.look_ahead)
         if self._planning is not None:
@@ -173,8 +173,8 @@ class Controller(SceneChanges, SplitStep):
         with located(str(source)):
             controller = cls(
                 parts.scene, parts.tasks, parts.solver, scenario.dt, scenario.avoidance, scenario.limits,
-                scenario.sensing, scenario.progress, parts.contacts, scenario.latency, scenario.planning, None,
-                scenario.dynamics,
+                scenario.sensing, scenario.progress, parts.contacts, scenario.latency, scenario.planning,
+                scenario.budget, scenario.dynamics,
             )  # fmt: skip
         for c in scenario.obstacles:
             if c.attached_to is not None:

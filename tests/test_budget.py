@@ -15,6 +15,7 @@ from qpavoid import (
     Status,
     build_scene,
     build_tasks,
+    load_scenario,
 )
 from qpavoid.budget import Budget
 from qpavoid.config import Sphere, Task
@@ -139,3 +140,16 @@ def test_relaxation_that_is_cut_brakes(panda):
 def test_budget_of_no_time_is_refused(panda, budget):
     with pytest.raises(ConfigError, match=r"budget: .*seconds"):
         make_controller(panda, [], budget)
+
+
+def test_scenarios_may_have_a_budget():
+    for field, spends in (("1e-9", True), ("null", False)):
+        controller, q = Controller.from_scenario(load_scenario("panda_ball", [f"budget={field}"]))
+        kinds = set()
+        for k in range(300):
+            solution = controller.step(q, k * controller.dt)
+            kinds |= {reason.kind for reason in solution.reasons}
+            q = pin.integrate(controller.scene.robot.model, q, controller.dt * solution.v)
+        assert (ReasonKind.BUDGET_SPENT in kinds) == spends
+    with pytest.raises(ConfigError, match=r"budget: .*greater than 0"):
+        load_scenario("panda_ball", ["budget=-1"])

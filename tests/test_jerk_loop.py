@@ -7,7 +7,19 @@ import pytest
 from closed_loop import ROWS, Ruler, cartesian, drive, make_controller, through_an_obstacle
 from conftest import Bench
 
-from qpavoid import Avoidance, ConfigError, Controller, Limits, Obstacle, ReasonKind, Robot, Sample, Status, build_scene
+from qpavoid import (
+    Avoidance,
+    ConfigError,
+    Controller,
+    Limits,
+    Obstacle,
+    ReasonKind,
+    Robot,
+    Sample,
+    Status,
+    UnknownName,
+    build_scene,
+)
 from qpavoid.config import Box, Sphere
 from qpavoid.run.simulate import simulate
 
@@ -178,6 +190,18 @@ def test_scenario_jerk_limit_applies_to_joints_without_one(tmp_path):
     make_controller(robot, frame="z")
     with pytest.raises(ConfigError, match=r"limits\.jerk: 1 of 3 coordinates have no acc.*give limits\.acceleration"):
         make_controller(robot, frame="z", limits=Limits(jerk=70.0))
+
+
+def test_limits_take_patterns_where_names_come_first(tmp_path):
+    cartesian(tmp_path)
+    body = {"name": "tool", "frame": "z", "shape": {"type": "sphere", "radius": 0.05}}
+    limits = {"acceleration": {"joint_x": 2.0, "*": 3.0, "joint_?": 4.0}, "jerk": {"*": 30.0}, "torque": {"*y": 7.0}}
+    robot = Robot.from_urdf(tmp_path / "cartesian.urdf", bodies=[body], limits=limits)
+    np.testing.assert_array_equal(robot.bounds().acceleration, [2.0, 4.0, 4.0])
+    np.testing.assert_array_equal(robot.bounds().jerk, [30.0, 30.0, 30.0])
+    assert robot.torque == {"joint_y": 7.0}
+    with pytest.raises(UnknownName, match=r"limits\.velocity: no joint 'arm\*'"):
+        Robot.from_urdf(tmp_path / "cartesian.urdf", bodies=[body], limits={"velocity": {"arm*": 1.0}})
 
 
 @pytest.mark.parametrize(

@@ -149,5 +149,14 @@ def test_lag_and_delay_cost_no_more_than_noise(panda, offset):
 def test_mujoco_is_asked_for_in_one_line(monkeypatch):
     monkeypatch.setitem(sys.modules, "mujoco", None)
     monkeypatch.delitem(sys.modules, "qpavoid.run.mujoco", raising=False)
-    with pytest.raises(ConfigError, match=r"^MuJoCo is not installed: pip install mujoco$"):
+    with pytest.raises(ConfigError, match=r"^MuJoCo is not installed: pip install mujoco, or 'qpavoid\[arena\]'$"):
         importlib.import_module("qpavoid.run.mujoco")
+
+
+@pytest.mark.parametrize("module", ["qpavoid.run.plant", "qpavoid.run.torque_plant"])
+def test_runs_on_a_plant_ask_for_mujoco_in_one_line(monkeypatch, module):
+    monkeypatch.setitem(sys.modules, "mujoco", None)
+    for name in ("qpavoid.run.mujoco", module):
+        monkeypatch.delitem(sys.modules, name, raising=False)
+    with pytest.raises(ConfigError, match=r"^MuJoCo is not installed: pip install mujoco, or 'qpavoid\[arena\]'$"):
+        importlib.import_module(module)

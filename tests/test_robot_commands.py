@@ -84,6 +84,24 @@ def test_missing_meshes_are_named_with_where_they_were_looked_for(cli, tmp_path)
     assert Robot.load("chain/robot.yaml").bodies.ngeoms == 4
 
 
+def test_a_mesh_that_was_left_out_is_named_by_every_later_check_and_load(cli, tmp_path):
+    urdf = write_chain(tmp_path)
+    rod, mesh = '<cylinder radius="0.03" length="0.2"/>', '<mesh filename="package://arm/hand.stl"/>'
+    head, link3, tail = urdf.read_text().partition('<link name="link3">')
+    urdf.write_text(head + link3 + tail.replace(rod, mesh, 1))
+    added = cli("robot", "add", urdf, "--allow-missing-meshes", "--samples", "50")
+    assert added.status == 0 and "link3_0: left out: a mesh in package://arm is missing" in added.stdout
+    checked = cli("robot", "check", "chain/robot.yaml")
+    assert checked.status == 0
+    assert len(re.findall(r"^warning  mesh .*link3_0: left out: a mesh in package://arm", checked.stdout, re.M)) == 1
+    with pytest.warns(RobotWarning, match="link3_0: left out: a mesh in package://arm is missing"):
+        Robot.load("chain/robot.yaml")
+    (tmp_path / "arm").mkdir()  # the mesh turns up, and the bodies were listed without it
+    write_stl(tmp_path / "arm" / "hand.stl")
+    with pytest.warns(RobotWarning, match="link link3: none of the listed bodies is theirs"):
+        Robot.load("chain/robot.yaml", package_dirs=[".."])
+
+
 @pytest.mark.parametrize("name", ["package://arm/hand.stl", "package:///arm/hand.stl", "model://arm/hand.stl"])
 def test_meshes_are_looked_for_as_pinocchio_does(tmp_path, name):
     (tmp_path / "arm").mkdir()

@@ -6,7 +6,19 @@ import qpsolvers
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from qpavoid import Problem, ReasonKind, Severity, Status, UnknownName, kernels, make_solver
+from qpavoid import (
+    ConfigError,
+    Controller,
+    Problem,
+    ReasonKind,
+    Severity,
+    Status,
+    UnknownName,
+    build_scene,
+    kernels,
+    load_scenario,
+    make_solver,
+)
 from qpavoid.config import Eq10Solver
 from qpavoid.errors import SolverNotInstalled
 from qpavoid.problem import AvoidanceRows, Tracking, make_problem
@@ -216,3 +228,27 @@ def test_unknown_and_missing_solvers_are_named():
         make_solver("qp:nope")
     with pytest.raises(SolverNotInstalled, match="pip install 'qpsolvers\\[gurobi\\]'"):
         make_backend("gurobi")
+
+
+def test_solver_is_given_as_in_a_file(panda):
+    """By name, or as the mapping that a scenario may have; errors are one line that names the field."""
+    block = {"name": "qp", "backend": "daqp", "regularization": 0.01}
+    law = make_solver(block)
+    assert law.label == "qp:daqp" and law.config.regularization == 0.01
+    controller = Controller(build_scene(panda), [], block)
+    assert controller.solver.label == "qp:daqp"
+    controller.solver = {"name": "eq10", "damping": 0.1}
+    assert controller.solver.label == "eq10" and controller.solver.config.damping == 0.1
+    for block, said in (
+        ({"name": "qq"}, r"^solver: unknown name 'qq'; did you mean '\w*qp'\?$"),
+        ({"backend": "daqp"}, r"^solver: `name` is missing; valid are eq10, "),
+        ({"name": "qp", "regularisation": 0.01}, r"^solver.regularisation: unknown key; did you mean 'regularization'"),
+        ({"name": "qp", "regularization": -1}, r"^solver.regularization: .*greater than 0"),
+    ):
+        for make in (make_solver, lambda law: Controller(build_scene(panda), [], law)):
+            with pytest.raises(ConfigError, match=said):
+                make(block)
+    with pytest.raises(ConfigError, match=r"^solver: NoneType is none; give a name"):
+        make_solver(None)
+    with pytest.raises(ConfigError, match=r"^--solver 'hpq': solver: unknown name 'hpq'; did you mean 'hqp'\?$"):
+        load_scenario("situation1", solver="hpq")

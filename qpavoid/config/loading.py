@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -12,6 +12,7 @@ from qpavoid.config import ScenarioConfig, expand_solver
 from qpavoid.config.explain import explain
 from qpavoid.config.files import parse_yaml, read_text
 from qpavoid.config.shipped import find_shipped
+from qpavoid.config.solver import SolverConfig, SolverField
 from qpavoid.errors import ConfigError
 
 Config = TypeVar("Config", bound=BaseModel)
@@ -44,6 +45,7 @@ def read_config(path: Path, model: type[Config], overrides: Sequence[str] = (), 
     """
     data = read_mapping(path)
     if solver is not None:
+        solver_fields(solver, f"--solver {solver!r}: ")
         chosen_solver, settings = _solver_mapping(solver), _solver_mapping(data.get("solver"))
         data["solver"] = (
             {**settings, **chosen_solver} if settings.get("name") == chosen_solver["name"] else chosen_solver
@@ -63,6 +65,19 @@ def validate(data: dict[str, Any], model: type[Config], path: Path) -> Config:
         return model.model_validate(data)
     except ValidationError as error:
         raise ConfigError(f"{path}: {explain(error, model, data)}") from None
+
+
+def solver_fields(value: Any, where: str = "") -> SolverConfig:
+    """Validate what may stand in the field `solver` of a scenario: a short form, or a mapping.
+
+    Raises:
+        ConfigError: unknown name or key, or bad value; `where` comes before it.
+    """
+    fields = {"solver": dict(value) if isinstance(value, Mapping) else value}
+    try:
+        return SolverField.model_validate(fields).solver
+    except ValidationError as error:
+        raise ConfigError(f"{where}{explain(error, SolverField, fields)}") from None
 
 
 def _solver_mapping(value: Any) -> dict[str, Any]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from fnmatch import fnmatchcase
 from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
@@ -47,7 +48,10 @@ class Body(Block):
 
 
 class JointLimits(Block):
-    """Limits that replace those of the URDF, by joint name."""
+    """Limits that replace those of the URDF, by joint name.
+
+    `*` and `?` match as in file names; a name itself comes before a pattern, a later pattern before an earlier one.
+    """
 
     position: dict[str, tuple[Number, Number]] = {}
     """Joint: from lower to upper [rad or m]."""
@@ -66,7 +70,7 @@ class JointLimits(Block):
             if lower >= upper:
                 raise ValueError(f"position of {joint!r}: needs lower < upper, got {lower}, {upper}; see `lock`")
         for joint in self.jerk:
-            if joint not in self.acceleration:
+            if not any(fnmatchcase(joint, other) or fnmatchcase(other, joint) for other in self.acceleration):
                 raise ValueError(f"jerk of {joint!r}: needs a limit under `acceleration`, too")
         return self
 

@@ -92,6 +92,9 @@ class ScenarioConfig(Block):
     """Control period [s]."""
     latency: Annotated[float, Field(ge=0, le=MAX_LATENCY)] = 0.0
     """Time after which the actuators follow a command [s]: states are predicted by so much."""
+    budget: Positive | None = None
+    """Time after which a control step leaves out what is left of relaxation, look-ahead and backup search, and brakes
+    or follows its backup trajectory instead [s]; runs are then not reproducible. Left out, or `null`: none."""
     duration: Positive
     """Length of the run [s]."""
     goal_tolerance: Positive = 0.005

@@ -111,3 +111,9 @@ _Solver = Annotated[
     Field(discriminator="name"),
 ]
 SolverConfig = Annotated[_Solver, BeforeValidator(expand_solver, json_schema_input_type=str | _Solver)]
+
+
+class SolverField(Block):
+    """The field `solver` alone: as an argument of a program, or as an option."""
+
+    solver: SolverConfig

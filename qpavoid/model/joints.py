@@ -10,7 +10,7 @@ import numpy as np
 import pinocchio as pin
 
 from qpavoid.config import JointLimits
-from qpavoid.errors import ConfigError, require_known
+from qpavoid.errors import ConfigError, matching, require_known
 from qpavoid.model.kinematics import MIMIC, turning_columns
 from qpavoid.model.limits import JointBounds
 from qpavoid.model.notes import Note, NoteKind
@@ -59,6 +59,27 @@ def _is_speed(velocity: Array) -> Mask:
     return np.asarray((velocity > 0.0) & (velocity < _NO_LIMIT))
 
 
+def limits_by_joint(model: Any, limits: JointLimits, path: Path) -> JointLimits:
+    """Replace patterns in the limits of a robot.yaml by the joints that they match, but for those that follow others.
+
+    Raises:
+        UnknownName: a name or a pattern without a joint.
+    """
+    joints = dict(zip(list(model.names)[1:], list(model.joints)[1:], strict=True))
+    free = [name for name, joint in joints.items() if joint.shortname() != MIMIC]
+    expanded = {}
+    for kind in JointLimits.model_fields:
+        given = getattr(limits, kind)
+        patterns = {pattern: value for pattern, value in given.items() if pattern not in joints}
+        expanded[kind] = {
+            name: value
+            for pattern, value in patterns.items()
+            for name in matching([pattern], free, f"{path}: limits.{kind}: no joint")
+        }
+        expanded[kind] |= {name: value for name, value in given.items() if name in joints}
+    return limits.model_copy(update=expanded)
+
+
 def set_limits(model: Any, limits: JointLimits, path: Path) -> None:
     """Set the position and velocity limits that a robot.yaml gives.
 
@@ -67,7 +88,7 @@ def set_limits(model: Any, limits: JointLimits, path: Path) -> None:
     """
     lower, upper = np.array(model.lowerPositionLimit), np.array(model.upperPositionLimit)
     velocity = np.array(model.velocityLimit)
-    for kind in ("position", "velocity", "acceleration", "jerk", "torque"):
+    for kind in JointLimits.model_fields:
         for name in getattr(limits, kind):
             if find_joint(model, name, f"{path}: limits.{kind}").shortname() == MIMIC:
                 raise ConfigError(f"{path}: limits.{kind}: {_follows(model, name)}; limit that one")

@@ -20,6 +20,7 @@ from qpavoid.model.joints import (
     assume_speeds,
     frame_index,
     joint_bounds,
+    limits_by_joint,
     middle_configuration,
     remove_joints,
     set_joints,
@@ -136,6 +137,7 @@ class Robot:
         model = read_model(urdf, config.root_joint, notes)
         ends = _end_effectors(model, config.end_effectors, path, notes)
         bodies = robot_bodies(config, urdf, model, path, notes)
+        config = config.model_copy(update={"limits": limits_by_joint(model, config.limits, path)})
         set_limits(model, config.limits, path)
         home = set_joints(model, middle_configuration(model), config.home, f"{path}: home")
         fixed = {**_fixed(urdf, config, notes), **config.lock}

@@ -18,7 +18,7 @@ from qpavoid.model.notes import Note, NoteKind
 from qpavoid.model.packages import absolute_entries
 from qpavoid.model.shape_checks import note_implausible_sizes
 from qpavoid.model.trajectory import rpy_to_matrix
-from qpavoid.model.urdf import read_pieces
+from qpavoid.model.urdf import missing_meshes, read_pieces
 
 
 def robot_bodies(config: RobotConfig, urdf: Path, model: Any, path: Path, notes: list[Note]) -> Any:
@@ -39,6 +39,8 @@ def robot_bodies(config: RobotConfig, urdf: Path, model: Any, path: Path, notes:
         )  # fmt: skip
 
     if not isinstance(config.bodies, str):
+        if config.allow_missing_meshes:
+            notes += _left_out_of_list(config, urdf, model, package_dirs)
         hulls = any(isinstance(body.shape, Hull) for body in config.bodies)
         return _listed_bodies(config.bodies, model, read().geometryObjects if hulls else (), path)
     pieces = read()
@@ -52,6 +54,18 @@ def robot_bodies(config: RobotConfig, urdf: Path, model: Any, path: Path, notes:
         remedy = "set `bodies` to convex or capsule"
         notes.append(Note(NoteKind.MESH, tuple(meshes), clause, remedy, "warning"))
     return bodies
+
+
+def _left_out_of_list(config: RobotConfig, urdf: Path, model: Any, package_dirs: Sequence[str]) -> list[Note]:
+    """Note meshes that are missing still, and links that were left out of the list since theirs was missing."""
+    notes, links = missing_meshes(urdf, model, package_dirs, config.visuals)
+    assert not isinstance(config.bodies, str)
+    listed = {body.frame for body in config.bodies}
+    if bare := tuple(link for link in links if link not in listed):
+        clause = "none of the listed bodies is theirs, though their shapes are at hand: nothing keeps clear of them"
+        remedy = "list some, as `qpavoid robot add` does; or set `allow_missing_meshes: false` if none is meant"
+        notes.append(Note(NoteKind.LINK, bare, clause, remedy, "warning"))
+    return notes
 
 
 def _listed_bodies(configs: Sequence[Body], model: Any, pieces: Sequence[Any], path: Path) -> Any:

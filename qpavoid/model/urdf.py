@@ -11,6 +11,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import coal
 import pinocchio as pin
 
 from qpavoid.config.shipped import EXAMPLES, example_robot
@@ -183,6 +184,30 @@ def read_pieces(
             remedy = "list bodies of your own, or set `visuals: false` where nothing can be hit"
             notes.append(Note(NoteKind.LINK, names, clause, remedy, "warning"))
     return pieces if enclosed else remove_enclosed(pieces, notes)
+
+
+def missing_meshes(
+    urdf: Path, model: Any, package_dirs: Sequence[str], visuals: bool = True
+) -> tuple[list[Note], list[str]]:
+    """Note the shapes of a URDF whose mesh cannot be found, and list the links with others; loads no mesh.
+
+    Args:
+        urdf: the file; an MJCF finds its meshes by its own rules, and gives neither.
+        model: its model.
+        package_dirs: folders to look for meshes in first, and `NAME=FOLDER`.
+        visuals: whether what is meant to be seen counts, of links without collision geometry.
+    """
+    notes: list[Note] = []
+    if is_mjcf(urdf):
+        return notes, []
+    reader = ShapeReader(
+        model, mesh_folders(urdf, package_dirs), str(urdf), notes, allow_faults=True, load=lambda *_: coal.Sphere(1.0)
+    )
+    frames = {piece.parentFrame for piece in reader.read(_root(urdf), "collision").geometryObjects}
+    if visuals:
+        frames |= {piece.parentFrame for piece in reader.read(_root(urdf), "visual", frames).geometryObjects}
+    links = [model.frames[frame].name for frame in sorted(frames)]
+    return [note for note in notes if note.kind is NoteKind.MESH], links
 
 
 def mesh_names(urdf: Path, tag: str = "") -> list[str]:

@@ -16,7 +16,7 @@ from qpavoid.problem import Array
 try:
     import mujoco
 except ImportError:
-    raise ConfigError("MuJoCo is not installed: pip install mujoco") from None
+    raise ConfigError("MuJoCo is not installed: pip install mujoco, or 'qpavoid[arena]'") from None
 
 
 class RenderedCamera:

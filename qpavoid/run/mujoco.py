@@ -20,9 +20,9 @@ from qpavoid.model.scene import Scene
 from qpavoid.problem import Array, IntArray
 
 try:
-    import mujoco
+    import mujoco as mujoco  # the other modules take it from here, so that one line says what is missing
 except ImportError:
-    raise ConfigError("MuJoCo is not installed: pip install mujoco") from None
+    raise ConfigError("MuJoCo is not installed: pip install mujoco, or 'qpavoid[arena]'") from None
 
 FLOATING = "JointModelFreeFlyer"
 """What pinocchio calls the joint of a base that floats."""

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import mujoco
 import numpy as np
 
 from qpavoid.model.scene import Scene
 from qpavoid.problem import Array
-from qpavoid.run.mujoco import build
+from qpavoid.run.mujoco import build, mujoco
 
 _STEP = 1e-3
 """Largest time step of the dynamics [s]: servos of 10 ms are resolved."""

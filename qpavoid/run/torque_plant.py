@@ -6,7 +6,6 @@ from collections import deque
 from collections.abc import Sequence
 from typing import Any
 
-import mujoco
 import numpy as np
 import pinocchio as pin
 
@@ -14,7 +13,7 @@ from qpavoid.config.plant import Payload, PlantSettings
 from qpavoid.errors import ConfigError
 from qpavoid.model.robot import Robot
 from qpavoid.problem import Array, Solution, require_finite
-from qpavoid.run.mujoco import FLOATING, add_joint, body_inertia, quaternion
+from qpavoid.run.mujoco import FLOATING, add_joint, body_inertia, mujoco, quaternion
 
 STEP = 1e-3
 """Largest time step of the dynamics [s]."""

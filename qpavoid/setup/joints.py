@@ -6,6 +6,7 @@ import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any
 
@@ -92,7 +93,7 @@ def joint_notes(joints: Sequence[Joint], config: RobotConfig) -> list[Note]:
                 wide.append(joint.name)
             elif 0.0 < span < least:
                 narrow.append(joint.name)
-        if joint.name not in config.limits.acceleration:
+        if not any(fnmatchcase(joint.name, pattern) for pattern in config.limits.acceleration):
             free.append(joint.name)
     position, velocity, acceleration = (
         f"`limits: {{{kind}: {{JOINT: {value}}}}}` in a robot.yaml"

@@ -5,12 +5,14 @@ A solver derives from `Solver`; those that ship are listed in SOLVERS and chosen
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 from pydantic import TypeAdapter, ValidationError
 
 from qpavoid.config import SolverConfig, expand_solver
+from qpavoid.config.loading import solver_fields
+from qpavoid.config.solver import SolverBlock
 from qpavoid.errors import ConfigError, UnknownName, nearest
 from qpavoid.solvers.analytic import Eq10, TrackingOnly
 from qpavoid.solvers.backends import backend_names
@@ -53,17 +55,27 @@ def parse_solver(name: str, settings: SolverConfig | None = None) -> SolverConfi
         raise UnknownName(f"unknown solver {name!r}{nearest(fields['name'], SOLVERS)}") from None
 
 
-def make_solver(config: SolverConfig | str) -> Solver:
+def make_solver(config: SolverConfig | Mapping[str, Any] | str) -> Solver:
     """Return a new solver of a configuration block or a short form.
 
     Args:
-        config: block of the scenario, or short form.
+        config: what the field `solver` of a scenario may be: its block, also as a mapping, or its short form.
 
     Raises:
         ConfigError, UnknownName, SolverNotInstalled: of the solver or the QP's back end.
     """
-    config = parse_solver(config) if isinstance(config, str) else config
+    if isinstance(config, str):
+        config = parse_solver(config)
+    elif isinstance(config, Mapping):
+        config = solver_fields(config)
+    elif not isinstance(config, SolverBlock):
+        raise ConfigError(f"solver: {type(config).__name__} is none; give a name, as in qp, or a mapping of its fields")
     return SOLVERS[config.name](config)
 
 
-__all__ = ["SOLVERS", "Solver", "backend_names", "check_solver", "make_solver", "parse_solver"]
+def as_solver(solver: Solver | SolverConfig | Mapping[str, Any] | str) -> Solver:
+    """Return a law as it is, and what `make_solver` makes of anything else that it takes."""
+    return make_solver(solver) if isinstance(solver, str | Mapping | SolverBlock) else solver
+
+
+__all__ = ["SOLVERS", "Solver", "as_solver", "backend_names", "check_solver", "make_solver", "parse_solver"]
