@@ -15,6 +15,7 @@ FOR_BENCHMARKS = {
     "qpavoid.control.distances": "DistanceQuery: the planner that proves a case solvable checks distances, grasps too",
     "qpavoid.control.tasks": "FrameTask: which goals the scores and other libraries follow",
     "qpavoid.solvers": "parse_solver: entrants are named as in scenarios",
+    "qpavoid.solvers.python_file": "laws and generators of users' files are run in one way",
     "qpavoid.solvers.backends": "the back ends that are compared",
     "qpavoid.kernels": "project: the compiled QP, which is compared with them",
     "qpavoid.geometry.bodies": "make_shape: free places for random obstacles",
