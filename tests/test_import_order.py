@@ -29,9 +29,9 @@ FOR_BENCHMARKS = {
 """What the benchmarks import beside public names and `qpavoid.{config,problem,model,run}`, and for what."""
 
 LEVELS = (
-    ("errors", "reason", "budget", "dynamics"), ("config", "problem"), ("kernels", "geometry"), ("solvers", "model"),
-    ("control",), ("safety",), ("planning",), ("controller",), ("run",), ("viz", "perception", "service"),
-    ("setup", "adapters"), ("cli",), ("__main__",),
+    ("errors", "reason", "budget", "dynamics", "field_docs"), ("config", "problem"), ("kernels", "geometry"),
+    ("solvers", "model"), ("control",), ("safety",), ("planning",), ("controller",), ("run",),
+    ("viz", "perception", "service"), ("setup", "adapters"), ("cli",), ("__main__",),
 )  # fmt: skip
 """Rooms (folders, and modules beside them) from the bottom up; those of one level do not know each other."""
 LEVEL = {room: level for level, rooms in enumerate(LEVELS) for room in rooms}
