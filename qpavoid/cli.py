@@ -14,7 +14,7 @@ from json import dumps
 from pathlib import Path
 from textwrap import wrap
 from time import perf_counter
-from typing import Annotated, Any
+from typing import Annotated, Any, NamedTuple
 
 import typer
 from rich.markup import escape
@@ -33,7 +33,8 @@ from qpavoid.run.simulate import simulate
 from qpavoid.run.terminal import ERR, OUT, names_of, progress, terminate_like_interrupt
 from qpavoid.service import commands as service_commands
 from qpavoid.setup import commands as robot_commands
-from qpavoid.solvers import SOLVERS, backend_names
+from qpavoid.solvers import SOLVERS, Solver, backend_names
+from qpavoid.solvers.python_file import names_file, solver_from_file
 from qpavoid.viz import commands as view_commands
 
 app = typer.Typer(
@@ -102,7 +103,9 @@ def list_(kind: Annotated[Kind | None, typer.Argument(help="Only these.")] = Non
 @app.command()
 def run(
     scenario: Annotated[str, typer.Argument(help="Shipped name or path of a YAML file.")],
-    solver: Annotated[str | None, typer.Option(help="Such as eq10 or qp:proxqp; as in the file if left out.")] = None,
+    solver: Annotated[
+        str | None, typer.Option(help="Such as eq10, qp:proxqp or my_law.py:MyLaw; as in the file if left out.")
+    ] = None,
     set_: Sets = None,
     out: Out = Path("out"),
     json: Json = False,
@@ -110,7 +113,7 @@ def run(
     verbose: Verbose = False,
 ) -> None:
     """Run one scenario; write its log and figures."""
-    logs, files = _run_all([load_scenario(scenario, set_ or (), solver)], out)
+    logs, files = _run_all([_job(scenario, set_, solver)], out)
     if figures:
         files += _draw(logs, out)
     metrics = [log.metrics() for log in logs]
@@ -124,7 +127,9 @@ def run(
 @app.command()
 def compare(
     scenarios: Annotated[list[str], typer.Argument(help="Shipped names or paths of YAML files.")],
-    solvers: Annotated[str, typer.Option(help="Comma-separated.")] = "tracking,eq10-literal,eq10,qp",
+    solvers: Annotated[
+        str, typer.Option(help="Comma-separated; FILE.py:NAME for one of your own.")
+    ] = "tracking,eq10-literal,eq10,qp",
     set_: Sets = None,
     out: Out = Path("out"),
     json: Json = False,
@@ -136,8 +141,8 @@ def compare(
     A collision is a result here, not a failure: the exit status is 1 only when a run was broken off.
     """
     names = names_of("--solvers", solvers)
-    configs = [load_scenario(scenario, set_ or (), name) for scenario in scenarios for name in names]
-    logs, files = _run_all(configs, out)
+    jobs = [_job(scenario, set_, name) for scenario in scenarios for name in names]
+    logs, files = _run_all(jobs, out)
     if figures:
         files += _draw(logs, out)
     metrics = [log.metrics() for log in logs]
@@ -145,7 +150,7 @@ def compare(
         print(to_json({"runs": metrics, "files": [str(f) for f in files]}))
     else:
         _print(metrics, files, out, verbose)
-    raise typer.Exit(0 if all(run["completed"] for run in metrics) and len(logs) == len(configs) else 1)
+    raise typer.Exit(0 if all(run["completed"] for run in metrics) and len(logs) == len(jobs) else 1)
 
 
 @app.command("bench", context_settings={"ignore_unknown_options": True, "help_option_names": []})
@@ -201,13 +206,33 @@ def warmup(
     print(f"{len(configs)} scenarios, {perf_counter() - begin:.0f} s; {1e-6 * size:.0f} MB of code in {FOLDER}")
 
 
-def _run_all(configs: list[ScenarioConfig], out: Path) -> tuple[list[Log], list[Path]]:
+class _Job(NamedTuple):
+    """A run: its scenario, and a law of the user's own in place of its solver."""
+
+    config: ScenarioConfig
+    law: Solver | None
+
+    @property
+    def label(self) -> str:
+        """Scenario and solver, for messages and names of files."""
+        return f"{self.config.source.stem} {(self.law or self.config.solver).label}"
+
+
+def _job(scenario: str, sets: list[str] | None, solver: str | None) -> _Job:
+    """Read a scenario, with a solver by name or from a file."""
+    if solver is not None and names_file(solver):
+        return _Job(load_scenario(scenario, sets or ()), solver_from_file(solver))
+    return _Job(load_scenario(scenario, sets or (), solver), None)
+
+
+def _run_all(jobs: list[_Job], out: Path) -> tuple[list[Log], list[Path]]:
     """Run and save one scenario after the other, the last one as far as it came."""
     logs: list[Log] = []
     files = []
-    for config in configs:  # faults of the last scenario show before the first one runs
-        Controller.from_scenario(config)
-    labels = [f"{config.source.stem} {config.solver.label}" for config in configs]
+    for config, law in jobs:  # faults of the last scenario show before the first one runs
+        controller, _ = Controller.from_scenario(config)
+        controller.solver = law or controller.solver
+    labels = [job.label for job in jobs]
     for label in labels:
         if labels.count(label) > 1:
             raise ConfigError(f"{label} would be written twice: leave one out, or rename one scenario file")
@@ -216,9 +241,9 @@ def _run_all(configs: list[ScenarioConfig], out: Path) -> tuple[list[Log], list[
     except OSError as error:
         raise ConfigError(f"--out {out}: {error.strerror}; give a folder that can be written") from None
     with progress() as bar, terminate_like_interrupt():
-        for label, config in zip(labels, configs, strict=True):
+        for label, (config, law) in zip(labels, jobs, strict=True):
             update = partial(_update, bar, bar.add_task(label, total=None))
-            logs.append(simulate(config, progress=update))
+            logs.append(simulate(config, law, update))
             files.append(logs[-1].save(out / f"{label.replace(' ', '_').replace(':', '-')}.npz"))
             if logs[-1].meta["stopped_by"]:
                 message = escape(f"{label}: broken off: {logs[-1].meta['stopped_by']}")

@@ -118,15 +118,12 @@ CONTACT_TOLERANCE = 1e-6
 
 
 class AvoidanceRows(NamedTuple):
-    """Rows J v >= b for the k pairs within the influence distance.
-
-    `d` is the distance that the gains take: between surfaces plus the scenario's offset.
-    """
+    """Rows J v >= b for the k pairs within the influence distance."""
 
     pair: IntArray
     """(k,) index of the pair in `Problem.pair_names`, in increasing order."""
     d: Array
-    """(k,) distance that the gains take [m]."""
+    """(k,) distance that the gains take: between surfaces, plus the scenario's offset [m]."""
     J: Array
     """(k, nv) velocity Jacobian of the distances [m/rad or 1]."""
     b: Array
@@ -143,7 +140,9 @@ class Problem(NamedTuple):
     """Everything that a solver may know about a control step."""
 
     tracking: Tracking
+    """Rows of the tasks."""
     avoidance: AvoidanceRows
+    """Rows of the pairs within the influence distance."""
     lower: Array
     """(nv,) lower bound on v from all joint limits; never above `upper`."""
     upper: Array
@@ -240,6 +239,7 @@ class Solution(NamedTuple):
     v: Array
     """(nv,) joint velocity [rad/s or m/s]."""
     status: Status = Status.SOLVED
+    """Whether every constraint is met, some were relaxed, or the robot brakes to a standstill."""
     reasons: tuple[Reason, ...] = ()
     """What was relaxed, or why the robot stops; empty where neither."""
     slack: Array | None = None

@@ -178,6 +178,7 @@ class Reason(NamedTuple):
     """One thing that a control step relaxed, assumed or could not do."""
 
     kind: ReasonKind
+    """Kind of event; see there for its subject and amount."""
     subject: tuple[str, ...] = ()
     """Names: the bodies of a pair, a joint, a task, an obstacle, an argument."""
     amount: float | None = None
@@ -185,6 +186,7 @@ class Reason(NamedTuple):
     unit: str = ""
     """Unit of `amount`: m, m/s, rad, rad/s, s, 1/s, Nm, N, % or - ."""
     severity: Severity = Severity.WARNING
+    """Weight for a supervisor: that of the kind, unless the step knows better."""
     detail: str = ""
     """More for people, not for programs."""
 

@@ -8,6 +8,7 @@ import sys
 from importlib.metadata import version
 from pathlib import Path
 
+import numpy as np
 import pytest
 import yaml
 from conftest import Result
@@ -109,6 +110,54 @@ def test_compare_keeps_a_log_of_each_solver(cli):
     assert [run["collided"] for run in document["runs"]] == [True, False, False]
     assert all(run.keys() >= METRICS for run in document["runs"])
     assert [Log.load(file).meta["solver"] for file in document["files"]] == solvers
+
+
+LAWS = """
+import numpy as np
+from qpavoid import Solution, Solver
+
+
+class Slow(Solver):
+    def solve(self, problem):
+        return Solution(0.5 * problem.v_tracking)
+
+
+class Plain:
+    bounded = True
+
+    def solve(self, problem):
+        return Solution(np.clip(0.5 * problem.v_tracking, problem.lower, problem.upper))
+
+
+def half(problem):
+    return 0.5 * problem.v_tracking
+
+
+class Needy(Slow):
+    def __init__(self, gain):
+        pass
+"""
+
+
+def test_laws_of_a_file_run_and_are_compared(cli, tmp_path):
+    (tmp_path / "laws.py").write_text(LAWS)
+    names = ["Slow", "Plain", "half"]
+    words = ("situation1", "--set", "duration=0.5", "--no-figures", "--json")
+    result = cli("compare", *words, "--solvers", ",".join([*(f"laws.py:{name}" for name in names), "tracking"]))
+    document = json.loads(result.stdout)
+    assert [run["solver"] for run in document["runs"]] == [*names, "tracking"]
+    steps = [np.linalg.norm(Log.load(file).v[0]) for file in document["files"]]
+    assert steps[:3] == pytest.approx([0.5 * steps[3]] * 3, rel=0.05)
+    assert json.loads(cli("run", *words, "--solver", "laws.py:half").stdout)["solver"] == "half"
+    for name, said in (
+        ("laws.py", "laws.py: give FILE.py:NAME"),
+        ("laws.py:Slo", "did you mean 'Slow'"),
+        ("laws.py:np", "laws.py:np: is no law"),
+        ("laws.py:Needy", "laws.py:Needy: cannot be made without arguments"),
+        ("other.py:Slow", "other.py: cannot be read"),
+        ("hpq", "--solver 'hpq': solver: unknown name 'hpq'; did you mean 'hqp'?"),
+    ):
+        assert_refused(cli("run", "situation1", "--no-figures", "--solver", name), said)
 
 
 def test_compare_checks_all_before_the_first_run(cli, scene, tmp_path):

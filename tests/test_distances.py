@@ -23,8 +23,19 @@ from conftest import (
     random_scene,
 )
 
-from qpavoid import Avoidance, Controller, Obstacle, Robot, Sample, build_scene, build_tasks, config, load_scenario
-from qpavoid.config import HalfSpace
+from qpavoid import (
+    Avoidance,
+    Controller,
+    NumericalError,
+    Obstacle,
+    Robot,
+    Sample,
+    build_scene,
+    build_tasks,
+    config,
+    load_scenario,
+)
+from qpavoid.config import HalfSpace, Sphere
 from qpavoid.control import distances
 from qpavoid.model import kinematics
 from qpavoid.model import views as memory
@@ -341,3 +352,27 @@ def test_hulls_and_curved_bodies_that_are_apart_need_no_coal(monkeypatch):
         tick = controller.tick(robot.home, t, obstacles={"hull": [-0.8 - t, 0.0, 0.0]})
         names = {name for pair in tick.proximity.pair for name in controller.scene.pair_names[pair]}
         assert {"o0", "o1", "o2", "o3", "floor", "hull"} < names and tick.proximity.distance.min() > 0.0
+
+
+def test_distances_of_all_pairs_by_name(panda):
+    """Of two balls at known places, one far beyond d2, one given by a step: from its surface to the nearest capsule."""
+    balls = [Obstacle.at(name, Sphere(radius=0.1), [x, 0.0, 0.5]) for name, x in (("near", 1.0), ("far", 5.0))]
+    controller = Controller(build_scene(panda, balls, spare_obstacles=2), [])
+    controller.filter(panda.home, np.zeros(panda.model.nv), obstacles={"near": [0.9, 0.0, 0.5]})
+    all_pairs = controller.pair_distances(panda.home)
+    assert len(all_pairs) == len([pair for pair in controller.scene.pair_names if all(pair)])
+    distances = [pair.distance for pair in all_pairs]
+    assert distances == sorted(distances) and np.isfinite(distances).all()
+    for pair in all_pairs:
+        gap = np.subtract(pair.point_b, pair.point_a)
+        np.testing.assert_allclose(gap, pair.distance * pair.normal, atol=1e-6)
+        for name, x in (("near", 0.9), ("far", 5.0)):
+            if name in pair.bodies:
+                point = (pair.point_a, pair.point_b)[pair.bodies.index(name)]
+                assert np.linalg.norm(point - [x, 0.0, 0.5]) == pytest.approx(0.1, abs=1e-6)
+    own = {frozenset(pair.bodies): pair.distance for pair in all_pairs if not {"near", "far"} & set(pair.bodies)}
+    assert own == pytest.approx(dict(panda.home_distances), abs=1e-6)
+    within = controller.pair_distances(panda.home, within=0.3)
+    assert [pair.bodies for pair in within] == [pair.bodies for pair in all_pairs if pair.distance <= 0.3]
+    with pytest.raises(NumericalError, match="q: shape"):
+        controller.pair_distances(panda.home[:-1])

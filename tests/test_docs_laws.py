@@ -38,6 +38,7 @@ FIGURES = [
     rows for rows in tables() if "Σ|Δq̇| [rad/s]" in rows[0] and not any(" / " in cell for cell in rows[0].values())
 ]
 """Tables of single runs; the one of ratios has two figures in a cell."""
+SNIPPETS = re.findall(r"```python\n(.*?)```", PAGE, re.S)
 COMMANDS = re.findall(r"^    qpavoid (compare .*)$", PAGE, re.M)
 
 
@@ -68,8 +69,13 @@ def test_laws_page_has_all_settings_at_their_defaults():
 def test_laws_page_commands_run(cli):
     for command in COMMANDS:
         assert ran(cli, f"{command} --set duration=0.02 --no-figures"), command
-    (snippet,) = re.findall(r"```python\n(.*?)```", PAGE, re.S)
-    compile(snippet, "docs/laws.md", "exec")
+
+
+def test_law_of_ones_own_keeps_the_distance_of_its_scene():
+    names = {}
+    exec(compile(SNIPPETS[1], "docs/laws.md", "exec"), names)
+    assert f"It keeps the {1e3 * names['closest']:.0f} mm" in PAGE
+    assert f"is {1e3 * names['left']:.0f} mm from its goal" in PAGE
 
 
 @pytest.mark.slow
@@ -93,7 +99,7 @@ def test_laws_page_figures_are_those_of_its_commands(cli):
 @pytest.mark.slow
 def test_laws_page_snippet_prints_what_the_page_says(capsys):
     """But for the digits."""
-    (snippet,) = re.findall(r"```python\n(.*?)```", PAGE, re.S)
+    snippet, _ = SNIPPETS
     (said,) = re.findall(r"```text\n(.*?)```", PAGE, re.S)
     exec(compile(snippet, "docs/laws.md", "exec"), {})
     numbers = r"(?<![\w.])\d+"

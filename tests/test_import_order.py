@@ -15,6 +15,7 @@ FOR_BENCHMARKS = {
     "qpavoid.control.distances": "DistanceQuery: the planner that proves a case solvable checks distances, grasps too",
     "qpavoid.control.tasks": "FrameTask: which goals the scores and other libraries follow",
     "qpavoid.solvers": "parse_solver: entrants are named as in scenarios",
+    "qpavoid.solvers.python_file": "laws and generators of users' files are run in one way",
     "qpavoid.solvers.backends": "the back ends that are compared",
     "qpavoid.kernels": "project: the compiled QP, which is compared with them",
     "qpavoid.geometry.bodies": "make_shape: free places for random obstacles",
@@ -28,9 +29,9 @@ FOR_BENCHMARKS = {
 """What the benchmarks import beside public names and `qpavoid.{config,problem,model,run}`, and for what."""
 
 LEVELS = (
-    ("errors", "reason", "budget", "dynamics"), ("config", "problem"), ("kernels", "geometry"), ("solvers", "model"),
-    ("control",), ("safety",), ("planning",), ("controller",), ("run",), ("viz", "perception", "service"),
-    ("setup", "adapters"), ("cli",), ("__main__",),
+    ("errors", "reason", "budget", "dynamics", "field_docs"), ("config", "problem"), ("kernels", "geometry"),
+    ("solvers", "model"), ("control",), ("safety",), ("planning",), ("controller",), ("run",),
+    ("viz", "perception", "service"), ("setup", "adapters"), ("cli",), ("__main__",),
 )  # fmt: skip
 """Rooms (folders, and modules beside them) from the bottom up; those of one level do not know each other."""
 LEVEL = {room: level for level, rooms in enumerate(LEVELS) for room in rooms}

@@ -5,6 +5,8 @@ import sys
 from pathlib import Path
 
 import qpavoid
+from qpavoid.model.kinematics import Kinematics
+from qpavoid.problem import AvoidanceRows, Proximity, Tracking
 
 PACKAGE = Path(qpavoid.__file__).parent
 
@@ -71,3 +73,12 @@ def test_public_names_exist():
     assert sorted(qpavoid.__all__) == sorted(set(qpavoid.__all__))
     for name in qpavoid.__all__:
         assert hasattr(qpavoid, name)
+
+
+def test_help_says_what_each_field_of_a_named_tuple_is():
+    """As the source has it below each field; Python alone says `Alias for field number 5`."""
+    public = [getattr(qpavoid, name) for name in qpavoid.__all__]
+    for value in [*public, Proximity, Tracking, AvoidanceRows, Kinematics]:
+        for field in getattr(value, "_fields", ()):
+            assert not getattr(value, field).__doc__.startswith("Alias for"), f"{value.__name__}.{field}"
+    assert qpavoid.Solution.v.__doc__ == "(nv,) joint velocity [rad/s or m/s]."

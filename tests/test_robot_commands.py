@@ -18,6 +18,7 @@ from qpavoid.config.shipped import find_robot
 from qpavoid.model.notes import RobotWarning
 from qpavoid.model.packages import find_mesh
 from qpavoid.run.simulate import simulate
+from qpavoid.setup import commands
 from qpavoid.setup.add import DescribeOptions, describe
 from qpavoid.setup.check import check_robot
 from qpavoid.setup.sampling import touching
@@ -226,7 +227,7 @@ def test_bad_arguments_are_refused_in_one_line(cli, tmp_path, arguments, words):
 # --- add ------------------------------------------------------------------------------------------------------
 
 
-def test_the_written_command_writes_the_same_again(cli, tmp_path):
+def test_the_written_command_writes_the_same_again(cli, tmp_path, monkeypatch):
     """What was edited since is overwritten by force alone."""
     write_chain(tmp_path)
     arguments = ["--name", "my arm", "--bodies", "capsule", "--bodies", "link0=convex", "--home", "joint1=0.5",
@@ -242,9 +243,32 @@ def test_the_written_command_writes_the_same_again(cli, tmp_path):
     again = shlex.split(command.removeprefix("# Again: qpavoid "))
     assert cli(*again).stdout.count("unchanged") == 2
     path.write_text(before.replace("joint1: 0.5", "joint1: 0.6"))
-    refused = cli(*again)
+    with monkeypatch.context() as patch:
+        patch.setattr(commands, "describe", None)  # it is refused before the work begins
+        refused, another = cli(*again), cli(*again, "--samples", "41")
     assert refused.status == 2 and "--force" in refused.stderr and "0.6" in path.read_text()
+    assert another.status == 2 and "--force" in another.stderr
     assert "updated" in cli(*again, "--force").stdout and path.read_text() == before
+
+
+def test_home_is_shown_as_angles_and_poses_of_the_tools(cli, tmp_path):
+    """Links of 0.3 m in a row along z, the first joint about x turned by 0.5 rad: r = (0, -0.6 sin, 0.3 + 0.6 cos)."""
+    write_chain(tmp_path)
+    added = cli("robot", "add", "chain.urdf", "--home", "joint1=0.5", "--samples", "40", "--lock", "joint3").stdout
+    checked = cli("robot", "check", "chain/robot.yaml").stdout
+    document = json.loads(cli("robot", "check", "chain/robot.yaml", "--json").stdout)
+    home = document["home"]
+    assert home["joint1"] == 0.5 and set(home) == {"joint1", "joint2"}
+    a, b = home["joint1"], home["joint1"] + home["joint2"]
+    ((tool, (xyz, rpy)),) = document["end_effector_poses"].items()
+    expected = [0.0, -0.3 * (math.sin(a) + math.sin(b)), 0.3 + 0.3 * (math.cos(a) + math.cos(b))]
+    np.testing.assert_allclose(xyz, expected, atol=1e-9)
+    np.testing.assert_allclose(rpy, [b, 0.0, 0.0], atol=1e-9)
+    for text in (added, checked):
+        assert re.search(rf"^home pose +joint1 0\.5, joint2 {home['joint2']:.4g}$", text, re.MULTILINE)
+        numbers = re.search(rf"^ +{tool}: xyz (\S+) (\S+) (\S+) m, rpy (\S+) (\S+) (\S+) rad$", text, re.MULTILINE)
+        np.testing.assert_allclose([float(number) for number in numbers.groups()], [*xyz, *rpy], atol=5.1e-4)
+    assert "the SRDF's" not in cli("robot", "add", "chain.urdf", "--samples", "40", "--out", "other").stdout
 
 
 def test_a_run_into_the_folder_of_the_urdf_does_not_honour_its_own_srdf(cli, tmp_path):

@@ -497,6 +497,7 @@ def test_bench_run_show_and_resume(cli, folder, monkeypatch):
         (["run", "smoke", "--cluster", "tcp://127.0.0.1:1", "--out", "o"], "no scheduler answers: .*start one with"),
         (["run", "smoke", "--cluster", "nonsense://x", "--out", "o"], "no scheduler answers: .*start one with"),
         (["show", "nowhere", "--family", "post", "--seed", "1"], "nowhere: no results here"),
+        (["run", "smoke", "--entrant", "my_law.py"], r"my_law\.py: give FILE\.py:NAME"),
     ],
 )
 def test_bad_input_is_a_line_and_exit_status_2(cli, monkeypatch, words, said):

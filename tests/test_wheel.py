@@ -30,7 +30,7 @@ except SystemExit as end:
 def call(*command: object, cwd: Path) -> str:
     clean = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
     words = [str(word) for word in command]
-    done = subprocess.run(words, cwd=cwd, env=clean, capture_output=True, text=True, timeout=300, check=False)
+    done = subprocess.run(words, cwd=cwd, env=clean, capture_output=True, text=True, timeout=900, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
     return done.stdout
 
@@ -110,3 +110,20 @@ def test_installed_wheel_runs_away_from_the_checkout(built, python, tmp_path):
         assert document["completed"] is True
         assert document["collided"] is False
         assert (tmp_path / document["files"][0]).is_file()
+
+
+def test_installed_wheel_runs_with_the_lowest_versions_it_allows(built, tmp_path):
+    """Direct dependencies at their lower bounds of `pyproject.toml`, as uv resolves them; it ships as a wheel."""
+    venv.create(tmp_path / "lowest", with_pip=True)
+    python = tmp_path / ("lowest/Scripts/python.exe" if os.name == "nt" else "lowest/bin/python")
+    call(python, "-m", "pip", "install", "--quiet", "uv", cwd=tmp_path)
+    install = (python, "-m", "uv", "pip", "install", "--quiet", "--python", python)
+    call(*install, "--resolution", "lowest-direct", "-r", ROOT / "pyproject.toml", cwd=tmp_path)
+    call(*install, "--no-deps", built[0], cwd=tmp_path)
+    versions = call(python, "-m", "pip", "freeze", cwd=tmp_path)
+    assert "numpy==2.2.0" in versions.splitlines()
+    command = python.with_name("qpavoid.exe" if os.name == "nt" else "qpavoid")
+    arguments = ("panda_line", "--set", "duration=0.5", "--no-figures", "--json")
+    document = json.loads(call(command, "run", *arguments, cwd=tmp_path))
+    assert document["completed"] is True
+    assert document["collided"] is False

@@ -79,9 +79,10 @@ def _blocks_at(model: type[BaseModel], loc: tuple[int | str, ...]) -> list[type[
 
 def _blocks(annotation: Any) -> list[type[BaseModel]]:
     """List every block inside an annotation."""
-    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+    arguments = typing.get_args(annotation)  # asked first: Python 3.10 takes list[float] as a type
+    if not arguments and isinstance(annotation, type) and issubclass(annotation, BaseModel):
         return [annotation]
-    return [block for inner in typing.get_args(annotation) for block in _blocks(inner)]
+    return [block for inner in arguments for block in _blocks(inner)]
 
 
 def _tags(block: type[BaseModel]) -> set[str]:

@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
+from math import inf
 from typing import Any
 
 from qpavoid.control.builder import ProblemBuilder
 from qpavoid.control.distances import DistanceQuery
 from qpavoid.control.observer import MomentumObserver
 from qpavoid.control.obstacle_states import ObstacleStates
+from qpavoid.control.pair_distances import PairDistance, pair_distances
 from qpavoid.errors import ConfigError, UnknownName, nearest
 from qpavoid.model.sample import Sample
 from qpavoid.model.scene import Obstacle, Scene
-from qpavoid.problem import Array
+from qpavoid.problem import Array, require_finite
 
 
 class SceneChanges:
@@ -180,6 +182,26 @@ class SceneChanges:
         if (contacts := self._builder.rows.contacts) is not None and (own := other._builder.rows.contacts) is not None:
             contacts.take_over(own)
         self._scene_changed("take_over", other)
+
+    def pair_distances(self, q: Array, within: float = inf) -> list[PairDistance]:
+        """Return how far all bodies are from each other, obstacles being where the last step took them to be.
+
+        It takes milliseconds, and changes nothing: for checks and displays between steps. A step itself has the pairs
+        within d2, in `Tick.proximity`. Uncertainties and ages of obstacles are not taken off; of a point cloud, there
+        is the nearest point to each body.
+
+        Args:
+            q: configuration (nq,).
+            within: distance up to which pairs are listed [m]; all that are checked if left out.
+
+        Returns:
+            Names, distance, normal and witness points of each pair, the nearest first.
+
+        Raises:
+            NumericalError: q has the wrong shape, NaN or infinity.
+        """
+        q = require_finite("q", q, (self.scene.robot.model.nq,))
+        return pair_distances(self.scene, self.distances(), self.obstacle_states, q, within)
 
     def distances(self) -> DistanceQuery:
         """Return distances of the scene in memory of their own, which know what is attached to the robot."""

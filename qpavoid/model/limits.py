@@ -16,8 +16,8 @@ from qpavoid.reason import Reason, ReasonKind
 
 _TURN = 2.0 * np.pi
 """Excess above which q is probably in degrees: a turn, which no joint exceeds its limit by [rad]."""
-
-
+_NOISE = 3e-3
+"""Excess below which it may be noise of the measurement alone [rad or m]."""
 _RECOVERY_SHARE = 0.1
 """Share of its speed limit at which a coordinate recovers [-]."""
 _MAX_RECOVERY_SPEED = 0.2
@@ -98,7 +98,8 @@ class JointBounds:
         reasons = []
         for i in np.flatnonzero(np.maximum(below, above) > tolerance).tolist():
             amount, j = float(-below[i] if below[i] > 0.0 else above[i]), int(self.v_index[i])
-            hint = "is it in degrees?" if abs(amount) > _TURN else ""
+            size = abs(amount)
+            hint = "is it in degrees?" if size > _TURN else "noise of the measurement?" if size < _NOISE else ""
             reasons.append(Reason.of(ReasonKind.LIMIT_RECOVERY, names[j], amount=amount, unit=units[j], detail=hint))
         return tuple(reasons)
 

@@ -24,6 +24,7 @@ from qpavoid.problem import Array, Solution, Status
 from qpavoid.reason import Reason, ReasonKind
 from qpavoid.run.log import STATUSES, Log
 from qpavoid.run.machine import versions
+from qpavoid.solvers.solver import NamedSolver
 
 if TYPE_CHECKING:
     from qpavoid.run.torque_plant import TorquePlant
@@ -187,12 +188,12 @@ class Recorder:
         """
         self._flush()
         scene, robot, plant = self._scene, self._scene.robot, self._plant
-        bounds = robot.bounds()
+        bounds, is_named = robot.bounds(), isinstance(self._controller.solver, NamedSolver)
         meta = {
             "scenario": self._scenario.source.stem,
             "title": self._scenario.title,
-            "solver": self._scenario.solver.label,
-            "config": self._scenario.model_dump(mode="json"),
+            "solver": self._controller.solver.label,
+            "config": self._scenario.model_dump(mode="json", exclude=None if is_named else {"solver"}),
             "source": self._scenario.source.name,
             "completed": stopped_by is None and self._count == len(self._arrays["t"]),
             "stopped_by": stopped_by,

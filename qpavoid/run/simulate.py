@@ -19,7 +19,7 @@ from qpavoid.model.robot import Robot
 from qpavoid.problem import Array, State
 from qpavoid.run.log import Log
 from qpavoid.run.recorder import Recorder
-from qpavoid.solvers import parse_solver
+from qpavoid.solvers import Solver, parse_solver
 
 if TYPE_CHECKING:
     from qpavoid.run.torque_plant import TorquePlant
@@ -31,7 +31,7 @@ class StartWarning(UserWarning):
 
 def simulate(
     scenario: ScenarioConfig | str,
-    solver: str | None = None,
+    solver: str | Solver | None = None,
     progress: Callable[[int, int], None] | None = None,
     plant: Literal["mujoco"] | PlantSettings | None = None,
 ) -> Log:
@@ -42,7 +42,7 @@ def simulate(
 
     Args:
         scenario: configuration, shipped name or path.
-        solver: replaces the scenario's solver, as in `eq10` or `qp:proxqp`.
+        solver: replaces the scenario's solver, as in `eq10` or `qp:proxqp`; or a `Solver` of your own.
         progress: called after each tick with the number done and the number in all.
         plant: robot with torque motors in MuJoCo, `mujoco` for one that is as its model; it needs a scenario with a
             `dynamics` block. That of the scenario, if any, where it is left out. The log then has torques, and where
@@ -51,20 +51,28 @@ def simulate(
     Raises:
         ConfigError, UnknownName, SolverNotInstalled: the scenario cannot be built, or MuJoCo is not installed.
     """
+    law = None if isinstance(solver, str) else solver
     if isinstance(scenario, str):
-        scenario = load_scenario(scenario, solver=solver)
-    elif solver is not None:
+        scenario = load_scenario(scenario, solver=solver if isinstance(solver, str) else None)
+    elif isinstance(solver, str):
         settings = parse_solver(solver, scenario.solver)
         scenario = scenario.model_copy(update={"solver": settings})
     if plant is not None:
         update = {"plant": PlantSettings() if plant == "mujoco" else plant}
         scenario = scenario.model_copy(update=update)
-    return run(scenario, None, progress)
+    return run(scenario, None, progress, law)
 
 
-def run(scenario: ScenarioConfig, robot: Robot | None, progress: Callable[[int, int], None] | None = None) -> Log:
-    """Run a scenario, see `simulate`, with its robot if that is loaded already."""
+def run(
+    scenario: ScenarioConfig,
+    robot: Robot | None,
+    progress: Callable[[int, int], None] | None = None,
+    law: Solver | None = None,
+) -> Log:
+    """Run a scenario, see `simulate`, with its robot if that is loaded already, and by another law than its own."""
     controller, q = Controller.from_scenario(scenario, robot)
+    if law is not None:
+        controller.solver = law
     _check_start(controller, q, scenario)
     dt, ticks = scenario.dt, round(scenario.duration / scenario.dt) + 1
     follower = Follower(controller.scene.robot.model, q, scenario.latency, dt)

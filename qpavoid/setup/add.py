@@ -165,7 +165,10 @@ def _describe(urdf: Path, options: DescribeOptions, progress: Callable[[str], No
     home = find_home(active, home_candidates(active, semantics), bare.end_effectors, d1, options.home, options.seed)
     progress("comparing with the geometry")
     unchecked = pairs.measure_unchecked(active, pieces, disabled)
-    notes += [*(note for entry in unchecked for note in entry.notes()), *_notes_of_home(active, home, options)]
+    notes += [
+        *(note for entry in unchecked for note in entry.notes()),
+        *_notes_of_home(active, home, options, bool(semantics.states)),
+    ]
     if not bare.end_effectors:
         remedy = "list the frames of your tools under `end_effectors`"
         notes.append(Note(NoteKind.FRAME, (), "no end effector was recognised", remedy))
@@ -221,7 +224,7 @@ def _assumed_speeds(model: Any, robot_model: Any) -> dict[str, float | list[floa
     return speeds_by_joint
 
 
-def _notes_of_home(robot: Robot, home: Home, options: DescribeOptions) -> Iterator[Note]:
+def _notes_of_home(robot: Robot, home: Home, options: DescribeOptions, has_states: bool) -> Iterator[Note]:
     """Yield notes on the origin of the home pose, and on what is wrong with it."""
     kind = NoteKind.HOME
     if home.clearance <= 0.0:
@@ -234,7 +237,8 @@ def _notes_of_home(robot: Robot, home: Home, options: DescribeOptions) -> Iterat
         clause = f"nearest pair, {1e3 * home.clearance:.1f} mm apart: no pose with room to move was found"
         yield Note(kind, home.nearest or (), clause, "give a pose with --home JOINT=VALUE", "warning")
     if home.preference is None:
-        start = "the one that was wished" if options.home else "the SRDF's poses and the middle of the joints' ranges"
+        start = "the SRDF's poses and " * has_states + "the middle of the joints' ranges"
+        start = "the one that was wished" if options.home else start
         clause = f"drawn near {start}, where pairs are too near or a limb is singular"
         moved_joints = tuple(name for name, value in joint_values(robot.model, home.q).items() if value)
         yield Note(kind, moved_joints, clause, "--home JOINT=VALUE")

@@ -22,10 +22,18 @@ from qpavoid.run.terminal import ERR, OUT
 from qpavoid.setup.add import PROTRUSION, WRIST_PROTRUSION, DescribeOptions, Description, Root, describe
 from qpavoid.setup.check import Report, check_robot
 from qpavoid.setup.fit import Bodies
-from qpavoid.setup.joints import Joint
+from qpavoid.setup.joints import Joint, joint_values
 from qpavoid.setup.pairs import pair_reasons, reasons_in_words
 from qpavoid.setup.sampling import SAMPLES, SEED
-from qpavoid.setup.texts import description_files, note_lines, summary, write_files
+from qpavoid.setup.texts import (
+    description_files,
+    frame_poses,
+    home_facts,
+    note_lines,
+    refuse_edited,
+    summary,
+    write_files,
+)
 
 _PATIENCE = 2.0
 """Least time between two lines of progress [s]."""
@@ -71,6 +79,9 @@ def check(
     )
     if json:
         shown = {name: value for name, value in vars(report).items() if name != "robot"}
+        if (made := report.robot) is not None:
+            poses = frame_poses(made, report.end_effectors)
+            shown |= {"home": joint_values(made.model, made.home), "end_effector_poses": poses}
         print(to_json({**shown, "usable": report.usable}))
     else:
         OUT.print(f"[bold]{escape(report.name)}[/]  {escape(report.source)}", highlight=False, soft_wrap=True)
@@ -96,6 +107,8 @@ def _facts(report: Report) -> Iterator[tuple[str, str]]:
     yield "end effectors", ", ".join(report.end_effectors) or "none recognised"
     if report.tick_us is not None:
         yield "control step", f"{report.tick_us:.0f} µs (median, tracks the end effectors, no obstacles)"
+    if report.robot is not None:
+        yield from home_facts(report.robot, report.end_effectors)
     if report.clearance is not None:
         yield "home", f"least distance {1e3 * report.clearance:.1f} mm"
     for frame, limb in report.conditioning.items():
@@ -168,9 +181,11 @@ def add(
     urdf = find_robot(path)
     if urdf.suffix in (".yaml", ".yml"):
         raise ConfigError(f"{path}: is described already; give a URDF or MJCF")
-    description = describe(urdf, options, Progress())
-    folder = out or Path(description.config.name)
+    folder = out or Path(options.name or urdf.stem)
     command = shlex.join(["qpavoid", *(word for word in sys.argv[1:] if word not in ("--force", "--json"))])
+    if not force:
+        refuse_edited(folder, command)
+    description = describe(urdf, options, Progress())
     outcome = write_files(description_files(description, folder, command), force)
     seconds = time.perf_counter() - begin
     if json:
@@ -243,6 +258,7 @@ def _document(description: Description, outcome: dict[Path, str], seconds: float
         "seed": options.seed,
         "srdf": None if description.honoured is None else str(description.honoured),
         **config.model_dump(include={"pair_margins", "end_effectors", "home", "lock"}),
+        "end_effector_poses": frame_poses(description.robot, config.end_effectors),
         "clearance": home.clearance,
         "nearest": home.nearest,
         "conditioning": home.conditioning,
@@ -252,9 +268,10 @@ def _document(description: Description, outcome: dict[Path, str], seconds: float
 
 
 def _report(description: Description, outcome: dict[Path, str], seconds: float) -> None:
-    facts = dict(summary(description))
-    ends = ", ".join(description.config.end_effectors) or "none recognised"
-    _print({"bodies": "", "protrusion": "", "pairs": "", "end effectors": ends, **facts}.items(), description.notes)
+    facts, ends = dict(summary(description)), description.config.end_effectors
+    home = facts.pop("home")
+    shown = [*facts.items(), ("end effectors", ", ".join(ends) or "none recognised")]
+    _print([*shown, *home_facts(description.robot, ends), ("home", home)], description.notes)
     where = f"in {seconds:.1f} s; in a scenario: `robot: {next(iter(outcome))}`"
     _print([*((what, str(path)) for path, what in outcome.items()), ("", where)])
 

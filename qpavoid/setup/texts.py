@@ -2,21 +2,32 @@
 
 from __future__ import annotations
 
+import hashlib
 import os.path
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
+import numpy as np
+import pinocchio as pin
 import yaml
 
 from qpavoid.config.shipped import EXAMPLES, example_robot
 from qpavoid.errors import ConfigError
+from qpavoid.model.joints import frame_index
 from qpavoid.model.notes import SEVERITIES, Note, NoteKind, abbreviate
+from qpavoid.model.robot import Robot
 from qpavoid.setup.add import Description
+from qpavoid.setup.joints import joint_values
 from qpavoid.setup.srdf import MADE_BY, srdf_text
 
 _WIDTH = 120
 """Of the lines of a robot.yaml [characters]."""
+_AGAIN, _DIGEST = "# Again: ", "# As written: "
+"""What comes before the command that writes a robot.yaml, and before the digest that tells whether it was edited."""
+_OCCUPIED = (
+    "is there already, with something else in it: left as it is; --force overwrites it, --out DIR writes elsewhere"
+)
 
 
 def description_files(description: Description, folder: Path, command: str = "") -> dict[Path, str]:
@@ -26,13 +37,33 @@ def description_files(description: Description, folder: Path, command: str = "")
     """
     srdf, head = folder / f"{description.config.name}.srdf", f"{description.config.name}: {MADE_BY}"
     comments = [head, *(f"{what.capitalize()}: {line}." for what, line in summary(description))]
-    comments += [*note_lines(description.notes), *([f"Again: {command}"] if command else [])]
+    comments += [*note_lines(description.notes), *([_AGAIN.removeprefix("# ") + command] if command else [])]
     text = "".join(f"# {line}\n" for line in comments) + _robot_yaml(description, folder, srdf.name)
+    if command:
+        text = text.replace(f"{_AGAIN}{command}\n", f"{_AGAIN}{command}\n{_DIGEST}{_digest(text)}\n", 1)
     ends = description.config.end_effectors
     return {
         folder / "robot.yaml": text,
         srdf: srdf_text(description.robot.model.name, head, description.disabled, ends),
     }
+
+
+def refuse_edited(folder: Path, command: str) -> None:
+    """Refuse, before any work, to write over a robot.yaml that was edited, or that another command wrote.
+
+    Raises:
+        ConfigError: there is one in the folder; `write_files` would refuse what comes of the work.
+    """
+    path = folder / "robot.yaml"
+    if path.is_file():
+        text = path.read_text(encoding="utf-8", errors="replace")
+        digest = re.search(f"^{re.escape(_AGAIN + command)}\n{_DIGEST}(\\w+)\n", text, re.MULTILINE)
+        if digest is None or _digest(text.replace(f"{_DIGEST}{digest[1]}\n", "", 1)) != digest[1]:
+            raise ConfigError(f"{path}: {_OCCUPIED}")
+
+
+def _digest(text: str) -> str:
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
 def write_files(contents: Mapping[Path, str], force: bool = False) -> dict[Path, str]:
@@ -52,10 +83,7 @@ def write_files(contents: Mapping[Path, str], force: bool = False) -> dict[Path,
             if old == content.encode():
                 outcome[path] = "unchanged"
             elif old is not None and not force:
-                raise ConfigError(
-                    f"{path}: is there already, with something else in it: left as it is; --force overwrites it, "
-                    "--out DIR writes elsewhere"
-                )
+                raise ConfigError(f"{path}: {_OCCUPIED}")
         for path in (path for path, what in outcome.items() if what != "unchanged"):
             path.parent.mkdir(parents=True, exist_ok=True)
             path.write_bytes(contents[path].encode())
@@ -124,6 +152,28 @@ def summary(description: Description) -> Iterator[tuple[str, str]]:
     if home.nearest is not None:
         clear = f"least distance {1000 * home.clearance:.1f} mm ({' - '.join(home.nearest)})"
     yield "home", "; ".join([clear, *(f"{frame}: {limb}" for frame, limb in home.conditioning.items())])
+
+
+def home_facts(robot: Robot, frames: Sequence[str]) -> Iterator[tuple[str, str]]:
+    """Yield the home pose: the position of each joint [rad or m], and where frames are in the world [m, rad]."""
+    values = joint_values(robot.model, robot.home)
+    yield "home pose", ", ".join(f"{joint} {value:.4g}" for joint, value in values.items()) or "of its base alone"
+    for frame, (xyz, rpy) in frame_poses(robot, frames).items():
+        yield "", f"{frame}: xyz {_numbers(xyz)} m, rpy {_numbers(rpy)} rad"
+
+
+def frame_poses(robot: Robot, frames: Sequence[str]) -> dict[str, tuple[list[float], list[float]]]:
+    """Return where frames of a robot are at home: position in the world [m], and roll, pitch, yaw [rad]."""
+    data, poses = robot.model.createData(), {}
+    pin.framesForwardKinematics(robot.model, data, robot.home)
+    for frame in filter(robot.model.existFrame, frames):
+        pose = data.oMf[frame_index(robot.model, frame)]
+        poses[frame] = np.array(pose.translation).tolist(), pin.rpy.matrixToRpy(pose.rotation).tolist()
+    return poses
+
+
+def _numbers(values: Sequence[float]) -> str:
+    return " ".join(f"{value + 0.0:.3f}" for value in np.round(values, 3))
 
 
 def _protrusions(description: Description) -> str:

@@ -4,21 +4,19 @@ from __future__ import annotations
 
 import hashlib
 import inspect
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any
-
-import numpy as np
 
 from qpavoid import Controller, Solver
 from qpavoid.config.files import read_text
 from qpavoid.errors import ConfigError
 from qpavoid.model.sample import Sample
-from qpavoid.problem import Array, Problem, Solution, require_finite
+from qpavoid.problem import Array, Problem, Solution
+from qpavoid.solvers.python_file import MAX_FILE_SIZE, OwnLaw, load_attribute
 from qpavoid_bench.arena.case import Case
 from qpavoid_bench.arena.entrants import Entrant
-from qpavoid_bench.arena.python_file import MAX_FILE_SIZE, load_attribute
 from qpavoid_bench.arena.rollout import Pilot
 from qpavoid_bench.arena.world import World
 
@@ -67,7 +65,9 @@ def _start_pilot(text: str, file: str, name: str, case: Case, world: World) -> P
         return pilot
     solver = candidate() if kind == "solver" else None
     controller, _ = Controller.from_scenario(case.scenario)
-    return _SolverPilot(controller, solver.solve if solver else candidate, getattr(solver, "bounded", False))
+    return _SolverPilot(
+        controller, OwnLaw(solver.solve if solver else candidate, name), getattr(solver, "bounded", False)
+    )
 
 
 def _classify(candidate: Any) -> str | None:
@@ -86,22 +86,19 @@ class _SolverPilot(Solver):
     An exception of the solver is a failure of the entrant, not the braking stop that the controller makes of it.
     """
 
-    def __init__(self, controller: Controller, solve: Callable[[Problem], Any], bounded: bool) -> None:
+    def __init__(self, controller: Controller, law: OwnLaw, bounded: bool) -> None:
         self.bounded = bounded
-        self._controller, self._solve = controller, solve
+        self._controller, self._law = controller, law
         self._error: Exception | None = None
         controller.solver = self
 
     def solve(self, problem: Problem) -> Solution:
         """Return the solver's solution, which may be a velocity alone."""
         try:
-            answer = self._solve(problem)
-            solution = answer if isinstance(answer, Solution) else Solution(np.asarray(answer, dtype=np.float64))
-            require_finite("its velocity", solution.v, problem.lower.shape)
+            return self._law.solve(problem)
         except Exception as error:  # whatever a user's law does
             self._error = error
             raise
-        return solution
 
     def step(self, q: Array, t: float, targets: Mapping[str, Sample], obstacles: Mapping[str, Sample]) -> Solution:
         """Compute the velocity to follow until the next step."""

@@ -178,6 +178,8 @@ def _check_seeds(count: int) -> int:
 def _entrant(name: str, folder: Path) -> Entrant:
     """Return an entrant by shipped name, installed or not, or from a file."""
     file, _, inside = name.rpartition(":")
+    if name.endswith(".py"):
+        raise ConfigError(f"{name}: give FILE.py:NAME, with the class or function in it, as in my_law.py:MyLaw")
     if file.endswith(".py"):
         return entrant_from_file(folder / file, inside)
     return ENTRANTS[name] if name in ENTRANTS else find_entrant(name)

@@ -17,9 +17,9 @@ from qpavoid.config.loading import read_config, read_mapping
 from qpavoid.config.shipped import find_robot, find_shipped, shipped_names
 from qpavoid.errors import ConfigError, UnknownName, located, nearest
 from qpavoid.model.robot import Robot
+from qpavoid.solvers.python_file import MAX_FILE_SIZE, load_attribute
 from qpavoid_bench.arena.families import adversarial, moving, statics, teleoperation, two_arms
 from qpavoid_bench.arena.families.parameters import Draw, Parameter
-from qpavoid_bench.arena.python_file import MAX_FILE_SIZE, load_attribute
 
 Generator = Callable[[Draw, Robot], Mapping[str, Any]]
 """Function from draws and the robot to fields of a scenario; the robot's locked joints are gone, its home is the
