@@ -27,7 +27,7 @@ campaign: .venv/dev
 smoke: .venv/dev
 	$(BIN)/qpavoid bench smoke
 
-docs: .venv/dev
+docs: .venv/docs
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
 
 lint: .venv/dev
@@ -43,6 +43,10 @@ types: .venv/dev
 
 .venv/view: pyproject.toml | .venv/bin/python
 	$(BIN)/pip install --quiet --editable '.[view]'
+	touch $@
+
+.venv/docs: pyproject.toml | .venv/bin/python
+	$(BIN)/pip install --quiet --editable '.[docs]'
 	touch $@
 
 .venv/dev: pyproject.toml | .venv/bin/python

@@ -1,7 +1,8 @@
 """What the documentation site adds to these pages: files of the repository that they link to, and maths.
 
 Pages link to tests, examples and results beside `docs`. The site has a copy of each, below `tree/`, so that no link
-leads out of it. Maths is written to MathML when the site is built: a browser draws that by itself.
+leads out of it. Maths is written to MathML when the site is built, and indices in prose (κ_c) as such: a browser draws
+both.
 """
 
 import posixpath
@@ -14,6 +15,10 @@ from mkdocs.structure.files import File
 
 ROOT = Path(__file__).parents[1]
 LINK = re.compile(r"(\]\()([^)#\s:]+)((?:#[^)\s]*)?\))")
+APART = re.compile(r"(<(pre|code|math|script|style|h\d)\b.*?</\2>|<[^>]+>)", re.DOTALL)
+"""What is no prose: code, maths, headings, and tags themselves."""
+INDEXED = re.compile(r"(?<![\w.])([A-Za-zα-ωΑ-Ωẋḋ]\u0307?)_([a-z0-9]{1,3})(?![a-z0-9_(])")
+"""A symbol of one letter with an index, such as κ_c or J_p2."""
 MATHS = re.compile(r'<(div|span) class="arithmatex">\\[(\[](.*?)\\[)\]]</\1>', re.DOTALL)
 ALWAYS = ("CHANGELOG.md", "CONTRIBUTING.md", "NOTICE.md")
 """Files that the navigation names."""
@@ -80,5 +85,9 @@ def on_page_markdown(markdown, page, config, files):
 
 
 def on_page_content(html, page, config, files):
-    """Write maths as MathML."""
-    return MATHS.sub(lambda match: convert(unescape(match[2]), "block" if match[1] == "div" else "inline"), html)
+    """Write maths as MathML, and indices in prose as such."""
+    html = MATHS.sub(lambda match: convert(unescape(match[2]), "block" if match[1] == "div" else "inline"), html)
+    parts = APART.split(html)  # in turns: prose, a part that is none, the name of its tag
+    parts[::3] = [INDEXED.sub(r"<i>\1</i><sub>\2</sub>", part) for part in parts[::3]]
+    del parts[2::3]
+    return "".join(parts)

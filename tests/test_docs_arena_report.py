@@ -27,7 +27,7 @@ def rows_of(heading):
 
 def test_its_sections_are_those_of_the_report_in_their_order():
     blank = {"str": "", "int": 1, "float": 0.01, "bool": False}
-    run = {name: blank[kind] for name, kind in COLUMNS.items()} | {"family": "…"}
+    run = {name: blank[kind] for name, kind in COLUMNS.items()} | {"family": "…", "entrant": "qp"}
     lines = report_lines(comparable_results(pd.DataFrame([run]), Path()), {})
     titles = [line.removeprefix("## ") for line in lines if line.startswith("## ")]
     assert [name for name, _ in rows_of("| section |")] == titles

@@ -16,7 +16,8 @@ class Fixed(Block):
     position: Vec3 | None = None
     """World position [m]."""
     rpy: Vec3 | None = None
-    """Roll, pitch, yaw about the fixed world axes x, y, z [rad]."""
+    """Roll, pitch, yaw about the fixed world axes x, y, z [rad]; left out, a task holds the orientation of the start,
+    an obstacle has that of the world."""
 
 
 class Line(Block):
@@ -36,7 +37,7 @@ class Line(Block):
     profile: Literal["constant", "smooth"] = "constant"
     """`constant` speed, or `smooth`: the rest-to-rest quintic (peak speed 1.875 times the mean)."""
     rpy: Vec3 | None = None
-    """Constant orientation: roll, pitch, yaw about the fixed world axes [rad]."""
+    """Constant orientation: roll, pitch, yaw about the fixed world axes [rad]; left out, as of `fixed`."""
 
     @model_validator(mode="after")
     def _one_end(self) -> Line:
@@ -54,7 +55,8 @@ class Waypoints(Block):
     positions: Annotated[list[Vec3], Field(min_length=2)]
     """World positions [m], one a time."""
     rpys: list[Vec3] | None = None
-    """Orientations as roll, pitch, yaw about the fixed world axes [rad], one a time; the shortest turn between."""
+    """Orientations as roll, pitch, yaw about the fixed world axes [rad], one a time; the shortest turn between.
+    Left out, as of `fixed`."""
     profile: Literal["constant", "smooth"] = "constant"
     """How each piece is timed: `constant` speed, or `smooth` (rest-to-rest quintic)."""
 
@@ -86,7 +88,7 @@ class Circle(Block):
     turns: Positive | None = None
     """Number of turns after which it rests [-]; left out, it goes on."""
     rpy: Vec3 | None = None
-    """Constant orientation: roll, pitch, yaw about the fixed world axes [rad]."""
+    """Constant orientation: roll, pitch, yaw about the fixed world axes [rad]; left out, as of `fixed`."""
 
 
 class Csv(Block):
