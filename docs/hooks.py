@@ -17,7 +17,7 @@ ROOT = Path(__file__).parents[1]
 LINK = re.compile(r"(\]\()([^)#\s:]+)((?:#[^)\s]*)?\))")
 APART = re.compile(r"(<(pre|code|math|script|style|h\d)\b.*?</\2>|<[^>]+>)", re.DOTALL)
 """What is no prose: code, maths, headings, and tags themselves."""
-INDEXED = re.compile(r"(?<![\w.])([A-Za-zα-ωΑ-Ωẋḋ]\u0307?)_([a-z0-9]{1,3})(?![a-z0-9_(])")
+INDEXED = re.compile(r"(?<![A-Za-z0-9_.])([A-Za-zα-ωΑ-Ωẋḋ]\u0307?)_([a-z0-9]{1,3})(?![a-z0-9_(])")
 """A symbol of one letter with an index, such as κ_c or J_p2."""
 MATHS = re.compile(r'<(div|span) class="arithmatex">\\[(\[](.*?)\\[)\]]</\1>', re.DOTALL)
 ALWAYS = ("CHANGELOG.md", "CONTRIBUTING.md", "NOTICE.md")
@@ -84,9 +84,16 @@ def on_page_markdown(markdown, page, config, files):
     return LINK.sub(moved, markdown)
 
 
+def maths(match):
+    """MathML of a formula; one in a line of its own can be scrolled where it is wide."""
+    if match[1] == "div":
+        return f'<div class="maths">{convert(unescape(match[2]), "block")}</div>'
+    return convert(unescape(match[2]), "inline")
+
+
 def on_page_content(html, page, config, files):
     """Write maths as MathML, and indices in prose as such."""
-    html = MATHS.sub(lambda match: convert(unescape(match[2]), "block" if match[1] == "div" else "inline"), html)
+    html = MATHS.sub(maths, html)
     parts = APART.split(html)  # in turns: prose, a part that is none, the name of its tag
     parts[::3] = [INDEXED.sub(r"<i>\1</i><sub>\2</sub>", part) for part in parts[::3]]
     del parts[2::3]

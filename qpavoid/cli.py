@@ -295,9 +295,11 @@ def _print(metrics: list[dict[str, Any]], files: list[Path], out: Path, verbose:
     OUT.print(f"{' and '.join(counts)} in {out}{remedy}", highlight=False, soft_wrap=True)
     for file in files if verbose else ():
         OUT.print(str(file), highlight=False, soft_wrap=True)
-    for file in files:
-        if file.suffix == ".html":
-            OUT.print(f"all of it on one page: {file}", highlight=False, soft_wrap=True)
+    page = out / "index.html"
+    if page in files:
+        OUT.print(f"all of it on one page: {page}", highlight=False, soft_wrap=True)
+    elif page.is_file():
+        OUT.print(f"{page} and its figures are those of an earlier command", highlight=False, soft_wrap=True)
 
 
 def _show_warning(message: Warning | str, *_: Any) -> None:

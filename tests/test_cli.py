@@ -160,6 +160,13 @@ def test_laws_of_a_file_run_and_are_compared(cli, tmp_path):
         assert_refused(cli("run", "situation1", "--no-figures", "--solver", name), said)
 
 
+def test_an_older_page_is_said_to_be_one(cli, tmp_path):
+    words = ("run", "situation1", "--set", "duration=0.05", "--no-figures")
+    assert "index.html" not in cli(*words).stdout
+    (tmp_path / "out" / "index.html").touch()
+    assert "out/index.html and its figures are those of an earlier command" in cli(*words).stdout
+
+
 def test_compare_checks_all_before_the_first_run(cli, scene, tmp_path):
     good, bad = scene("good.yaml"), scene("bad.yaml", robot="pand")
     result = cli("compare", good, bad, "--no-figures")

@@ -256,6 +256,10 @@ def test_page_shows_every_figure_the_table_and_the_settings(sphere, panda, tmp_p
     files = [path for log in logs for path in plot_run(log, tmp_path)] + plot_compare(sphere[:3], tmp_path)
     text = write_index(logs, files, tmp_path).read_text(encoding="utf-8")
     assert set(re.findall(r'<img src="([^"]*)"', text)) == {path.name for path in files}
+    own = {f"{log.meta['scenario']}_{log.meta['solver'].replace(':', '-')}.npz" for log in logs}
+    assert all(name in text for name in own) and "of other commands" not in text
+    (tmp_path / "older_qp.npz").touch()
+    assert "of other commands: older_qp.npz." in write_index(logs, files, tmp_path).read_text(encoding="utf-8")
     assert "http" not in re.sub(r"<pre>.*?</pre>", "", text, flags=re.DOTALL)
     for log in logs:
         assert f"<td>{log.meta['solver']}</td>" in text

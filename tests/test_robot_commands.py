@@ -200,7 +200,11 @@ def test_bad_mjcf_is_refused_in_one_line(cli, tmp_path, text, message):
     [
         (["check", "pandaa"], ["unknown robot 'pandaa'", "did you mean 'panda'"]),
         (["check", "none.urdf"], ["none.urdf: no such file"]),
-        (["check", "example-robot-data:none.urdf"], ["none.urdf: no such file"]),
+        (["check", "example-robot-data:none.urdf"], ["none.urdf: no such file", "example-robot-data: holds ", "ur_d"]),
+        (
+            ["check", "example-robot-data:xarm_description/urdf/wrong.urdf"],
+            ["wrong.urdf: no such file; example-robot-data:xarm_description/urdf holds ", "xarm7.urdf"],
+        ),
         (["check", "panda", "--root", "wheels"], ["--root: 'wheels' is none of fixed, planar, free_flyer"]),
         (["add", "panda"], ["panda: is described already; give a URDF or MJCF"]),
         (["add", "chain.urdf", "--bodies", "box"], ["--bodies box: 'box' is none of auto, capsule, capsules, convex"]),

@@ -66,6 +66,15 @@ def example_robot(name: str) -> Path:
     return example_robot_data() / "example-robot-data" / "robots" / name.removeprefix(EXAMPLES)
 
 
+def example_listing(name: str) -> str:
+    """Say what the folder holds in which the file of `example-robot-data:PATH` should be, or the nearest one above."""
+    robots, path = example_robot(""), example_robot(name)
+    folder = next((above for above in path.parents if above.is_relative_to(robots) and os.path.isdir(above)), robots)
+    names = sorted(entry.name + "/" * entry.is_dir() for entry in folder.iterdir())
+    where = folder.relative_to(robots).as_posix() if folder.is_relative_to(robots) else ""
+    return f"{EXAMPLES}{where.removeprefix('.')} holds {', '.join(names)}"
+
+
 def find_robot(name_or_path: str, folder: Path | None = None) -> Path:
     """Find a robot.yaml, URDF, xacro or MJCF, by shipped name or by path.
 
@@ -77,7 +86,10 @@ def find_robot(name_or_path: str, folder: Path | None = None) -> Path:
         ConfigError, UnknownName: there is none.
     """
     if name_or_path.startswith(EXAMPLES):
-        return find_shipped("robot", example_robot(name_or_path))
+        path = example_robot(name_or_path)
+        if not os.path.isfile(path):
+            raise ConfigError(f"{name_or_path}: no such file; {example_listing(name_or_path)}")
+        return path
     if folder is not None and _looks_like_path(name_or_path) and os.path.isfile(folder / name_or_path):
         return folder / name_or_path
     return find_shipped("robot", name_or_path)

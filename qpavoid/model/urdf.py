@@ -14,7 +14,7 @@ from typing import Any
 import coal
 import pinocchio as pin
 
-from qpavoid.config.shipped import EXAMPLES, example_robot
+from qpavoid.config.shipped import EXAMPLES, example_listing, example_robot
 from qpavoid.errors import ConfigError
 from qpavoid.model.mjcf import check_mjcf, read_geoms, read_mjcf
 from qpavoid.model.notes import Note, NoteKind
@@ -40,6 +40,8 @@ def find_resource(value: str, folder: Path, where: str) -> Path:
     result = example_robot(value) if value.startswith(EXAMPLES) else folder / value
     if not os.path.isfile(result):  # False where the name is one that no file can have; Path.is_file may raise
         remedy = f"give a path relative to this file or {EXAMPLES}PATH"
+        if value.startswith(EXAMPLES):
+            remedy = example_listing(value)
         raise ConfigError(f"{where}: no such file {value!r}; {remedy}")
     return result
 

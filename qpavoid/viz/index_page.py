@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from datetime import datetime
 from html import escape
 from pathlib import Path
 
@@ -38,9 +39,14 @@ def write_index(logs: Sequence[Log], files: Sequence[Path], folder: Path) -> Pat
     sections = [_section([log for log in logs if log.meta["scenario"] == name], pictures) for name in scenarios]
     versions = ", ".join(f"{name} {version}" for name, version in logs[0].meta["versions"].items())
     path = folder / FILE
+    own = [f"{log.meta['scenario']}_{log.meta['solver']}.npz".replace(":", "-") for log in logs]
+    others = sorted({log.name for log in folder.glob("*.npz")} - set(own))
+    text = f"Of {', '.join(own)}, written {datetime.now():%Y-%m-%d %H:%M}."
+    text += f" In this folder, too, of other commands: {', '.join(others)}." if others else ""
     path.write_text(
         f'<!DOCTYPE html><html lang="en"><meta charset="utf-8"><title>qpavoid: {escape(", ".join(scenarios))}</title>'
-        f"<style>{_STYLE}</style><h1>qpavoid: {len(logs)} run{'s' * (len(logs) > 1)}</h1><nav>{links}</nav>"
+        f"<style>{_STYLE}</style><h1>qpavoid: {len(logs)} run{'s' * (len(logs) > 1)}</h1>"
+        f'<p class="note">{escape(text)}</p><nav>{links}</nav>'
         f'{"".join(sections)}<p class="note">{escape(versions)}</p></html>\n',
         encoding="utf-8",
     )
