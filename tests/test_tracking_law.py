@@ -261,6 +261,20 @@ def test_arm_rests_beyond_reach(request, tmp_path, seed, acceleration):
         assert np.linalg.norm(end.translation - target.position) < beyond + 0.12
 
 
+@pytest.mark.parametrize("arm", ["ur5", "bare_panda"])
+@pytest.mark.parametrize("weight", [1e-4, pytest.param(1e-3, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("dt", [0.01, pytest.param(0.005, marks=pytest.mark.slow)])
+def test_arm_with_a_light_posture_rests_beyond_reach(request, arm, weight, dt):
+    """The posture moves what the tool leaves free, where a stretched arm bends: it may not shake the tool back in."""
+    robot, (tool, _, _) = request.getfixturevalue(arm), ARMS[arm]
+    (pose,) = frames(robot, [tool], robot.home)
+    target = Sample.at(pose.translation + np.array([1.0, -1.5, 0.3]), pose.rotation)
+    tasks = build_tasks([Task(frame=tool), PostureTask(weight=weight)], robot, robot.home)
+    controller = Controller(build_scene(robot), tasks, dt=dt)
+    v, _ = follow(controller, robot.home, {tool: target}, 8.0)
+    assert chatter(v, int(0.5 / dt)) <= 1e-3
+
+
 @pytest.mark.parametrize(
     "seed", [3, 6, 9, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (0, 1, 2, 4, 5, 7, 8, 10, 11))]
 )

@@ -6,12 +6,15 @@ from typing import Any
 
 import numpy as np
 
-from qpavoid.kernels.cholesky import factorise, solve_factored
+from qpavoid.kernels.cholesky import dot, factorise, solve_factored
 from qpavoid.kernels.packing import compiled
+from qpavoid.kernels.singular_values import orthogonalise
 from qpavoid.problem import Array
 
 _SHIFT = 1e-11
 """Shift of the normal equations of all rows, over their largest diagonal [-]; two refinements take its effect away."""
+_ROUND_OFF = 1e-16
+"""Square of a row's part in a null space, over that of its largest entry, below which it has none [-]."""
 
 
 @compiled
@@ -25,6 +28,48 @@ def scale_straight(x: Any, A: Array, b: Array) -> None:
                 excess[x.row_tasks[r]] = max(excess[x.row_tasks[r]], rate)
     for r in x.straight_rows:
         b[r] /= excess[x.row_tasks[r]]
+
+
+@compiled
+def bent_directions(S: Array, B: Array, squares: Array, G: Array, curvatures: Array) -> Array:
+    """Compute γ_k n_kᵀ (s, n) of G on what the rows S move of the null space of the v_i.
+
+    With an orthonormal basis Q of that, the rows of Q G Qᵀ, made orthogonal, are γ_k times its eigenvectors.
+
+    Args:
+        S: (s, n).
+        B: σ_i v_iᵀ (c, n).
+        squares: σ_i² (c,).
+        G: curvature (n, n).
+        curvatures: out |γ_k| (s,), zero where there are less.
+    """
+    (count, nv), Q, size = S.shape, S.copy(), 0.0
+    for r in range(count):
+        for c in range(nv):
+            size = max(size, S[r, c] * S[r, c])
+        for i in range(len(B)):
+            if squares[i] > 0.0:
+                along = dot(Q[r], B[i]) / squares[i]
+                for c in range(nv):
+                    Q[r, c] -= along * B[i, c]
+    orthogonalise(Q, curvatures)
+    for r in range(count):
+        length = np.sqrt(curvatures[r]) if curvatures[r] > _ROUND_OFF * size else np.inf
+        for c in range(nv):
+            Q[r, c] /= length
+    H, directions, turned = np.empty((count, count)), np.zeros((count, nv)), np.empty(nv)
+    for r in range(count):
+        for c in range(nv):
+            turned[c] = dot(G[c], Q[r])
+        for k in range(count):
+            H[r, k] = dot(Q[k], turned)
+    orthogonalise(H, curvatures)
+    for r in range(count):
+        curvatures[r] = np.sqrt(curvatures[r])
+        for k in range(count):
+            for c in range(nv):
+                directions[r, c] += H[r, k] * Q[k, c]
+    return directions
 
 
 @compiled

@@ -12,6 +12,10 @@ size of its tasks, √‖J Jᵀ‖ in the Frobenius norm, v_i is weak: where A�
 the joints, m_i is so large that no joint of v_i is faster than that over 1 - σ_i²/l_i². The law is J⁺b/g, exactly,
 where σ_i >= l_i and σ_i² >= 4|w|, and there is nothing to choose.
 
+Rows that do not bend move the null space, too, where the others bend as well: a stretched arm's tool draws back by
+½ γ_k of a motion along n_k. With r = Σ (1 - σ_i²/m_i) u_i u_iᵀ w, the part of w that is left undone, γ_k and n_k are
+the eigenvalues and eigenvectors of G(r) on what those rows move of the null space; where nothing is left, r is 0.
+
 From full reach, a target that comes back is followed by folding to either side, and one of them ends at the limits of
 the joints. Where v_i is weak and v_iᵀ G(w) v_i > σ_i², with y_i v_i away from the middle of the joints' ranges, the
 speed along v_i is turned round: the arm goes back over full reach, and folds to the other side.
@@ -23,9 +27,10 @@ from typing import Any
 
 import numpy as np
 
+from qpavoid.kernels.cholesky import dot
 from qpavoid.kernels.packing import compiled
 from qpavoid.kernels.singular_values import orthogonalise
-from qpavoid.kernels.straight_rows import scale_straight, solve_together
+from qpavoid.kernels.straight_rows import bent_directions, scale_straight, solve_together
 from qpavoid.kernels.task_curvature import add_curvature, curvature_weights
 from qpavoid.kernels.task_scaling import (
     MISSING_SIZE,
@@ -53,8 +58,9 @@ def tracking_law(x: Any, A: Array, b: Array, v: Array, b_feasible: Array) -> flo
     """Write the velocity that follows the rows A v = b of all tasks.
 
     Rows of a constant A, as of postures, do not bend: they are scaled down to the joints' speeds, and solved together
-    with the others, which get the rows √(m_i - σ_i²) v_iᵀ v = 0. Tasks other than frames count with the largest
-    curvature that 1 m or 1 rad makes, |w|. In a direction that several tasks share, |w| counts each by its part in u_i.
+    with the others, which get the rows √(m_i - σ_i²) v_iᵀ v = 0, and √|γ_k| n_kᵀ v = 0 in their null space. Tasks other
+    than frames count with the largest curvature that 1 m or 1 rad makes, |w|, and not in γ_k. In a direction that
+    several tasks share, |w| counts each by its part in u_i.
 
     Args:
         x: reads feedback, scale, dead_beat, row_tasks, bending_rows, straight_rows, v_max, centering, dt, and what
@@ -80,10 +86,10 @@ def tracking_law(x: Any, A: Array, b: Array, v: Array, b_feasible: Array) -> flo
         v[:] = np.nan
         return 0.0
     B, rates = (A, b) if not len(straight) else (A[bending], b[bending])
-    damping = np.zeros(len(B))
+    damping = np.zeros(len(B) + len(straight))
     if not follow_well_conditioned(x, B, rates, v):
         rates = rates.copy()
-        B = _follow_bending(x, B, rates, v, damping)
+        B = _follow_bending(x, B, rates, v, damping, A[straight])
         for k in range(len(bending)):
             b_feasible[bending[k]] = rates[k]
     if len(straight):
@@ -97,15 +103,19 @@ def tracking_law(x: Any, A: Array, b: Array, v: Array, b_feasible: Array) -> flo
 
 
 @compiled
-def _follow_bending(x: Any, A: Array, b: Array, v: Array, damping: Array) -> Array:
-    """Write the velocity of the law for the rows that bend, by their singular values; return σ_i v_iᵀ (c, n).
+def _follow_bending(x: Any, A: Array, b: Array, v: Array, damping: Array, S: Array) -> Array:
+    """Write the velocity of the law for the rows that bend, by their singular values.
 
     Args:
         x: see `tracking_law`.
         A: the rows (c, n).
         b: in their velocity (c,), out b/g.
         v: out (n,).
-        damping: out m_i - σ_i² (c,).
+        damping: out m_i - σ_i² (c,), and of the directions of `bent_directions` (s,).
+        S: rows that do not bend (s, n).
+
+    Returns:
+        σ_i v_iᵀ (c, n), and below it the directions of `bent_directions`, where there are any.
     """
     count, nv = A.shape
     v[:] = 0.0
@@ -135,7 +145,18 @@ def _follow_bending(x: Any, A: Array, b: Array, v: Array, damping: Array) -> Arr
                 y *= _turn_round(x, B[i], y, squares[i], nearness)
             for c in range(nv):
                 v[c] += B[i, c] * y / m
-    return B
+    if not len(S) or damping.max() == 0.0:
+        return B
+    lacking = np.zeros(count)
+    for i in range(count):
+        if damping[i] > 0.0:
+            undone = damping[i] / (squares[i] + damping[i]) * dot(U[i], w)
+            for k in range(count):
+                lacking[k] += undone * U[i, k]
+    G[:] = 0.0
+    for part in range(len(x.feedback) // 3):
+        add_curvature(x, part, lacking[3 * part : 3 * part + 3], G)
+    return np.concatenate((B, bent_directions(S, B, squares, G, damping[count:])))
 
 
 @compiled
