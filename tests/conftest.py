@@ -39,12 +39,6 @@ BOX = config.Box(type="box", size=(0.2, 0.3, 0.1))
 CYLINDER = config.Cylinder(type="cylinder", radius=0.07, length=0.25)
 
 
-@pytest.hookimpl(optionalhook=True)
-def pytest_xdist_auto_num_workers(config):
-    """One process more than cores: a browser, a service or another interpreter is waited for now and then."""
-    return (os.cpu_count() or 1) + 1
-
-
 @pytest.fixture(scope="session", autouse=True)
 def compiled_kernels():
     """All kernels of a controller are on disk before any test: none finds on stderr that they are compiled."""
