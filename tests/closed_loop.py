@@ -8,6 +8,7 @@ from qpavoid import Avoidance, Controller, Limits, Robot, Sample, build_scene, b
 from qpavoid.config import Progress, ScenarioConfig, Sensing, Task
 from qpavoid.control.distances import DistanceQuery
 from qpavoid.model.kinematics import ForwardKinematics
+from qpavoid.planning.worker import ProcessWorker
 
 SHIPPED = load_scenario("situation1").source
 """A place from which scenarios made here are taken to be read, so that robots are found by name."""
@@ -149,7 +150,24 @@ def accelerations(vs, dt, before=None):
     return np.abs(np.diff(vs, axis=0, prepend=first[None])) / dt
 
 
+class Awaited(ProcessWorker):
+    """A process that plans, whose answers a step waits for."""
+
+    is_asked = False
+
+    def ask(self, question):
+        super().ask(question)
+        self.is_asked = True
+
+    def poll(self):
+        answer = None
+        while self.is_asked and answer is None and self.process.poll() is None:
+            answer = super().poll()
+        self.is_asked = False
+        return answer or super().poll()
+
+
 __all__ = [
-    "ROWS", "SHIPPED", "Limits", "Progress", "Ruler", "Sensing", "accelerations", "cartesian", "changed", "drive",
-    "make_controller", "planar", "scenario", "through_an_obstacle",
+    "ROWS", "SHIPPED", "Awaited", "Limits", "Progress", "Ruler", "Sensing", "accelerations", "cartesian", "changed",
+    "drive", "make_controller", "planar", "scenario", "through_an_obstacle",
 ]  # fmt: skip

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from closed_loop import Awaited
 
 from qpavoid import Controller, ScenarioConfig, Status, simulate
 from qpavoid.planning import worker
@@ -136,24 +137,12 @@ def test_process_answers_as_the_step_itself_would(monkeypatch):
     """A loop that waits for each answer gets the same commands; one whose process ends goes on with the law."""
     processes = []
 
-    class Awaited(worker.ProcessWorker):
+    class Known(Awaited):
         def __init__(self, parts):
             super().__init__(parts)
-            self.is_asked, self.answer = False, None
             processes.append(self.process)
 
-        def ask(self, question):
-            super().ask(question)
-            self.is_asked = True
-
-        def poll(self):
-            answer = None
-            while self.is_asked and answer is None and self.process.poll() is None:
-                answer = super().poll()
-            self.is_asked = False
-            return answer or super().poll()
-
-    monkeypatch.setattr(worker, "ProcessWorker", Awaited)
+    monkeypatch.setattr(worker, "ProcessWorker", Known)
     controller, q = Controller.from_scenario(gap(settle=3.0, worker="process"))
     inline, _ = Controller.from_scenario(gap(settle=3.0))
     solutions, q_end = run(controller, q, 150)

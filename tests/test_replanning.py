@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from closed_loop import Awaited
 
 from qpavoid import Controller, Obstacle, Points, Sample, build_scene, build_tasks
 from qpavoid.config import Box, Capsule, Planning, PointCloud, Task
@@ -129,20 +130,3 @@ def test_process_knows_what_is_attached_and_may_touch(panda, monkeypatch):
         answers[name] = [solution.v.tobytes() for solution in solutions], [solution.plan for solution in solutions]
     assert answers["inline"] == answers["process"]
     assert any(answers["inline"][1])
-
-
-class Awaited(worker.ProcessWorker):
-    """A process whose answers a step waits for."""
-
-    is_asked = False
-
-    def ask(self, question):
-        super().ask(question)
-        self.is_asked = True
-
-    def poll(self):
-        answer = None
-        while self.is_asked and answer is None and self.process.poll() is None:
-            answer = super().poll()
-        self.is_asked = False
-        return answer or super().poll()

@@ -18,6 +18,7 @@ from qpavoid.control.attach import Attachments
 from qpavoid.control.contacts import ContactRows
 from qpavoid.control.inputs import LARGEST_VELOCITY, Clock, Configurations
 from qpavoid.control.latency import CommandsUnderWay
+from qpavoid.control.obstacle_states import Observation, StepUpdate
 from qpavoid.control.obstacles import ObstacleTracker
 from qpavoid.control.settings import ControlSettings
 from qpavoid.control.slots import ObstacleSlots
@@ -105,7 +106,7 @@ class ProblemBuilder:
             self.rows.previous.remember(pin.difference(self._model, self._q_last, q) / (times.periods * self._dt))
             self._under_way.add(self.rows.previous.v)
         self._targets.last = targets
-        rows, query = self.rows, self.rows.query
+        rows = self.rows
         if times.resumed or (v is not None and self._clock.is_first):
             self._restart(np.zeros(self._model.nv) if v is None else v)
         elif times.periods > 1:
@@ -116,21 +117,15 @@ class ProblemBuilder:
             q = self._predict(q)
         self._clock.set(times.t)
         if update is not None:
-            observed = self.tracker.advance(update)
-            query.place(self.tracker.current)
+            observed = self._place(update)
             faults, assumptions = faults + observed.stop, assumptions + observed.assumptions
         if rows.dynamics is not None and v is not None:
             rows.dynamics.observe(q, v)
             faults, assumptions = rows.dynamics.touched(faults, assumptions)
-        is_settled = rows.compute(q, targets, v_desired)
-        if self.attachments.is_watching:
-            self.attachments.update()
-        if not is_settled and rows.position_margin < -OUTSIDE:
-            assumptions += self._bounds.outside(q, rows.joint_names, rows.joint_units)
-        step = self.begun = self._step
+        is_settled, step = rows.compute(q, targets, v_desired), self._step
         step.q, step.t, step.resumed, step.targets = rows.q, times.t + self._latency, times.resumed, targets
         step.is_settled, step.faults, step.assumptions, step.is_plain = is_settled, faults, assumptions, False
-        return step
+        return self._finish(step)
 
     def begin(self, q: Any, t: Any, targets: Any, obstacles: Any, v: Any) -> StepProblem:
         """Build the problem of a step of the tasks from its arguments, see `Controller.step`: whatever raises does so.
@@ -162,15 +157,26 @@ class ProblemBuilder:
         self._clock.set(now)
         step.q, step.t, step.resumed, step.targets, step.faults, step.assumptions = rows.q, now, False, samples, (), ()
         if update is not None:
-            step.assumptions, step.faults = self.tracker.advance(update)
-            rows.query.place(self.tracker.current)
+            step.assumptions, step.faults = self._place(update)
         rows.follows_tasks = True
         step.is_settled = rows.run()
+        step.is_plain = step.is_settled and not step.faults
+        return self._finish(step)
+
+    def _place(self, update: StepUpdate) -> Observation:
+        """Take over an update of obstacles, and place them."""
+        observed = self.tracker.advance(update)
+        self.rows.query.place(self.tracker.current)
+        return observed
+
+    def _finish(self, step: StepProblem) -> StepProblem:
+        """Do what follows once distances and rows are computed; the command of the step is not known yet."""
+        rows = self.rows
         if self.attachments.is_watching:
             self.attachments.update()
         if not step.is_settled and rows.position_margin < -OUTSIDE:
             step.assumptions += self._bounds.outside(rows.q, rows.joint_names, rows.joint_units)
-        step.is_plain, self.begun = step.is_settled and not step.faults, step
+        self.begun = step
         return step
 
     def _predict(self, q: Array | None) -> Array:
