@@ -371,6 +371,17 @@ def test_implausible_target_of_a_row_task_is_a_stop(panda):
         assert solution.reasons[0].key == ("IMPLAUSIBLE", ("target", name))
 
 
+@pytest.mark.parametrize("bad", [np.nan, 1e9])
+def test_measured_velocity_is_checked_in_each_step(bad):
+    """Also in steps that go the short way, whose velocity level does not need it."""
+    controller, q = Controller.from_scenario(changed("panda_line"))
+    v = np.zeros(controller.scene.robot.model.nv)
+    assert controller.step(q, 0.0, v=v).status is Status.SOLVED
+    solution = controller.step(q, controller.dt, v=np.full_like(v, bad))
+    assert solution.status is Status.STOPPED
+    assert solution.reasons[0].kind is ReasonKind.IMPLAUSIBLE
+
+
 def test_solver_is_checked_on_assignment():
     controller, _ = Controller.from_scenario(changed("humanoid_reach"))
     before = controller.solver
