@@ -43,8 +43,9 @@ _FEWEST_POSES = 10
 """Poses that are evaluated in a control step at least [-]: a candidate has about 45, and an obstacle does not wait."""
 _HORIZONS = (0.2, 0.05, 0.5)
 """h of backup policies [s]: the most successful first."""
-_UNBIASED_FRACTION = 0.25
-"""Fraction of the sampled policies without a bias velocity [-]."""
+_SAMPLES = 9
+"""Sampled policies among which each horizon comes once without a bias velocity [-]: odd, as two kinds of
+candidates take turns."""
 _BIAS_SPEEDS = (2.0, 30.0)
 """Range of ‖v̂‖ of the others, log-uniform [rad/s, m/s]: from a tie-break to full speed."""
 _CANDIDATES_AHEAD = 3
@@ -264,7 +265,11 @@ class BackupPlanner:
         backup, sufficient = self._backup, self._rollouts.sufficient_score
         if backup is None or self._is_valid(candidate, after_task):
             return True
-        return backup.score < sufficient and self._not_worse(candidate.score, backup.score)
+        if backup.score >= sufficient:
+            return False
+        clearance = self._rollouts.clearance_from(candidate, after_task)  # the solver may lead elsewhere by now
+        score = candidate.score._replace(clearance=min(clearance, candidate.score.clearance))
+        return clearance >= TOUCH and self._not_worse(score, backup.score)
 
     def _begin(self, command: _Command, is_valid: bool, poses: int) -> None:
         """Begin the next candidate, of which some poses can be evaluated in this control step."""
@@ -329,14 +334,12 @@ class BackupPlanner:
         )
 
     def _sample_policy(self) -> BackupPolicy:
-        """Sample a policy: each unbiased horizon once, then random ones."""
-        random, unbiased, number = self._random, self._rollouts.stop_policy.bias_velocity, self._sampled
+        """Sample a policy: each unbiased horizon, then random ones, by turns."""
+        random, unbiased, number = self._random, self._rollouts.stop_policy.bias_velocity, self._sampled % _SAMPLES
         self._sampled += 1
         if number < len(_HORIZONS):
             return BackupPolicy(_HORIZONS[number], unbiased)
         h = _HORIZONS[random.integers(len(_HORIZONS))]
-        if random.random() < _UNBIASED_FRACTION:
-            return BackupPolicy(h, unbiased)
         direction, speed = random.normal(size=self._model.nv), np.exp(random.uniform(*np.log(_BIAS_SPEEDS)))
         return BackupPolicy(h, speed / np.linalg.norm(direction) * direction)
 

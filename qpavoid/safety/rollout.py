@@ -220,16 +220,20 @@ class BackupRollouts:
         delay, one, two = abs(start.t - trajectory.start.t), trajectory.start.enabled, start.enabled
         if delay > self._dt or not (one is two or np.array_equal(one, two)):
             return False
-        offset = pin.difference(self._model, trajectory.start.q, start.q)
-        v, dv = np.ascontiguousarray(start.v), np.ascontiguousarray(start.dv)
-        max_offset = self._offset_of_start(self._packed_memory, offset, v, dv, trajectory.v, self._is_accelerated)
         obstacle_offset = delay * max_obstacle_speed if delay > _ROUND_OFF else 0.0
         now, then = self._obstacles.prediction, trajectory.prediction
         if now is not then and (len(now.external) or len(then.external)):
             radii = self.query.obstacle_radii
             obstacle_offset += kernels.prediction_error_bound(now, then, HORIZON + BEYOND, radii)
-        clearance = trajectory.clearance - self.lever_arm * max_offset - obstacle_offset
-        return bool(clearance >= self.sufficient_score.clearance)
+        clearance = self.clearance_from(trajectory, start) - obstacle_offset
+        return clearance >= self.sufficient_score.clearance
+
+    def clearance_from(self, trajectory: BackupTrajectory, start: Start) -> float:
+        """Bound the clearance of a trajectory from below that is joined from a start off its own [m]."""
+        offset = pin.difference(self._model, trajectory.start.q, start.q)
+        v, dv = np.ascontiguousarray(start.v), np.ascontiguousarray(start.dv)
+        max_offset = self._offset_of_start(self._packed_memory, offset, v, dv, trajectory.v, self._is_accelerated)
+        return float(trajectory.clearance - self.lever_arm * max_offset)
 
     def rollout(
         self, start: Start, policy: BackupPolicy, prefix: Array | None, must_beat: BackupTrajectory | None
