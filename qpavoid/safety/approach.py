@@ -37,6 +37,8 @@ class ApproachCheck:
             spans=np.zeros((count, 4)),
             peaks=np.zeros((count, 2)),
             scratch=np.zeros_like(now.states),
+            proof=np.full(3, -1.0),
+            proof_centers=np.zeros((len(query.table.joints), 3)),
             lever_arm=lever_arm,
             dt=settings.dt,
         )
@@ -60,6 +62,7 @@ class ApproachCheck:
     def reset(self) -> None:
         """Drop the paths."""
         self._memory.numbers.fill(np.iinfo(np.intp).min)
+        self._memory.proof[0] = -1.0
         self._first, self._moving = -1, self._obstacles.moving
 
     def is_far(self, v: Array, t: float) -> bool:
@@ -81,6 +84,7 @@ class ApproachCheck:
     def _extend(self, first: int) -> None:
         """Sample the paths from a multiple of their period until the horizon."""
         self._first, x, obstacles = first, self._memory, self._obstacles
+        x.proof[0] = -1.0
         missing = [s for s in range(first, first + PATH_POINTS) if x.numbers[s % PATH_POINTS] != s]
         for index, motion in obstacles.custom_trajectories.items():
             for s in missing:
