@@ -8,7 +8,7 @@ from qpavoid.safety.rollout import BackupPolicy
 
 _HORIZONS = (0.2, 0.05, 0.5)
 """h of backup policies [s]: the most successful first."""
-_SAMPLES = 9
+_SAMPLES = 7
 """Policies among which each horizon comes once without a bias velocity [-]: odd, as two kinds of candidates take
 turns."""
 _BIAS_SPEEDS = (2.0, 30.0)
