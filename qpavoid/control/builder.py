@@ -151,7 +151,7 @@ class ProblemBuilder:
         if self._budget.is_limited:
             self._budget.begin()
         rows = self.rows
-        follows = not obstacles and self.tracker.follows_trajectories and not rows.query.has_planes
+        follows = obstacles is None and self.tracker.follows_trajectories and not rows.query.has_planes
         update = None if follows else self.tracker.read(now, obstacles)
         if not self._take_usual(q, *self._usual_arguments):
             return None

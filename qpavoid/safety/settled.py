@@ -16,6 +16,8 @@ class SettledSteps:
     def __init__(self, rollouts: BackupRollouts, rows: RowAssembler) -> None:
         """Compile the check; `rows` are those of the control step."""
         self._rollouts, self._rows, self._separable = rollouts, rows, rollouts.query.table.separable
+        if not rollouts.adds_up:
+            return
         path = np.zeros((2, len(rows.v)))
         self._offset = kernels.direct(
             kernels.offset_after_step, rollouts.packed_memory, rows.packed, rows.q, path, path, 1, rollouts.enabled,
@@ -25,14 +27,14 @@ class SettledSteps:
     def leaves_valid(self, trajectory: BackupTrajectory, steps: int, t: float) -> bool:
         """Return whether a sufficient trajectory is certainly so after the step at t [s], without its first steps.
 
-        The step is settled, at the velocity of the rows, and obstacles move as the trajectory has it; see
+        False says nothing. The step is settled, at the velocity of the rows, and obstacles move as the trajectory has it; see
         `BackupRollouts.is_valid_from`.
         """
         x, start = self._rollouts, trajectory.start
+        if not x.adds_up:
+            return False
         end, then = t + x.dt, start.t + steps * x.dt
         if len(trajectory.v) <= steps or trajectory.contact_time < end + HORIZON - 1e-9 or abs(end - then) > ROUND_OFF:
-            return False
-        if not x.adds_up:
             return False
         rows = self._rows
         offset = self._offset(
