@@ -27,8 +27,8 @@ class SettledSteps:
     def leaves_valid(self, trajectory: BackupTrajectory, steps: int, t: float) -> bool:
         """Return whether a sufficient trajectory is certainly so after the step at t [s], without its first steps.
 
-        False says nothing. The step is settled, at the velocity of the rows, and obstacles move as the trajectory has it; see
-        `BackupRollouts.is_valid_from`.
+        False says nothing. The step is settled, at the velocity of the rows, and obstacles move as the trajectory has
+        it; see `BackupRollouts.is_valid_from`.
         """
         x, start = self._rollouts, trajectory.start
         if not x.adds_up:
