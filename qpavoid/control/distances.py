@@ -86,7 +86,7 @@ class DistanceQuery:
             centers=np.ones((bodies, 5)),
             radius=table.spheres[:, 3].copy(),
             travels=np.zeros(bodies),
-            reach=np.full(pairs, -np.inf),
+            limits=np.full(pairs, -np.inf),
             guesses=np.zeros((pairs, GUESS)),
             near=np.zeros(pairs, dtype=np.intp),
             rows=np.zeros(pairs, dtype=np.intp),
@@ -165,7 +165,7 @@ class DistanceQuery:
 
     def forget_guesses(self) -> None:
         """Let all searches start anew, not where they ended before: of curved shapes, that shows."""
-        self.arrays.guesses[:] = 0.0
+        self.arrays.guesses[:], self.arrays.limits[:] = 0.0, -np.inf
         for pair in self._by_coal.tolist():
             self._data.distanceRequests[pair].updateGuess(_FIRST_GUESS)
 
@@ -179,7 +179,7 @@ class DistanceQuery:
         self._set_max_square(slice(None), slice(body, body + 1))
         pairs = self.table.pairs_of(index)
         self._outdated |= pairs
-        x.guesses[pairs], x.reach[pairs] = 0.0, -np.inf
+        x.guesses[pairs], x.limits[pairs] = 0.0, -np.inf
         self._last_near = b""
         x.states[index] = obstacle.motion.sample(0.0).row
         kernels.place_obstacles(self.packed, np.array([index]), x.states, self._uncertainty)

@@ -71,7 +71,7 @@ class DistanceArrays(NamedTuple):
     """(g,) of the bounding spheres [m]."""
     travels: Array
     """(g,) bound on the path that any point of each body has travelled so far [m]."""
-    reach: Array
+    limits: Array
     """(m,) distance of each pair when it was computed plus the travels of its bodies until then: less those until now,
     it bounds the distance from below; -∞ of pairs that coal computes, and of those that are not known [m]."""
     guesses: Array
@@ -112,7 +112,7 @@ def near_pairs(x: DistanceArrays, beyond: float) -> tuple[int, int, int]:
 
     Args:
         x: reads poses, margin and travels; writes centers of movable bodies, near, rows, meeting, counts, results and
-            reach.
+            limits.
         beyond: that distance, less the margin [m]; infinite to leave none out.
 
     Returns:
@@ -144,18 +144,18 @@ def candidate_pairs(x: DistanceArrays) -> int:
 @inlined
 def least_distance(x: DistanceArrays, k: int) -> float:
     """Bound the distance of pair k from below by where its bodies have been since it was computed [m]."""
-    return x.reach[k] - x.travels[x.pairs[k, 0]] - x.travels[x.pairs[k, 1]]
+    return x.limits[k] - x.travels[x.pairs[k, 0]] - x.travels[x.pairs[k, 1]]
 
 
 @compiled
 def measure_pairs(x: DistanceArrays, pairs: IntArray) -> int:
-    """Write results and reach of some pairs (k,), and those of them that coal has to compute; return how many."""
+    """Write results and limits of some pairs (k,), and those of them that coal has to compute; return how many."""
     meeting = compute_distances(x.shapes, x.poses, x.pairs, x.method, pairs, x.guesses, x.results, x.meeting)
     for k in pairs:
         if x.method[k] > SPARE_BY_COAL:
-            x.reach[k] = x.results[k, 0] + x.travels[x.pairs[k, 0]] + x.travels[x.pairs[k, 1]]
+            x.limits[k] = x.results[k, 0] + x.travels[x.pairs[k, 0]] + x.travels[x.pairs[k, 1]]
     for k in x.meeting[:meeting]:
-        x.reach[k] = -np.inf
+        x.limits[k] = -np.inf
     return meeting
 
 

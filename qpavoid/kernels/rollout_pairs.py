@@ -39,7 +39,7 @@ class PairMemory(NamedTuple):
 @compiled
 def forget_pairs(x: Any, p: PairMemory) -> None:
     """Begin a rollout, of which nothing is known."""
-    x.reach[:], p.bounds[:] = -np.inf, np.inf
+    x.limits[:], p.bounds[:] = -np.inf, np.inf
 
 
 @compiled
