@@ -29,11 +29,9 @@ from qpavoid.control.settings import ControlSettings
 from qpavoid.errors import NumericalError
 from qpavoid.kernels.rollout import FINISHED, HORIZON, PAUSED, TOUCH
 from qpavoid.problem import Array, Mask, Proximity
-from qpavoid.safety.approach import ApproachCheck
-from qpavoid.safety.command import Command
-from qpavoid.safety.policies import BackupPolicies
+from qpavoid.safety.approach import ApproachCheck, SettledSteps
+from qpavoid.safety.candidates import BackupPolicies, Command
 from qpavoid.safety.rollout import LEAST_SCORE, BackupRollouts, BackupScore, BackupTrajectory, Start
-from qpavoid.safety.settled import SettledSteps
 
 _PERIOD_FRACTION = 0.128
 """Fraction of a control period in which candidates are computed [-]."""

@@ -1,10 +1,13 @@
-"""Policies of backup trajectories that are tried: each horizon without a bias, and random ones, by turns."""
+"""What candidates for a backup trajectory begin with: what is commanded before them, and the policies that are tried."""
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
-from qpavoid.safety.rollout import BackupPolicy
+from qpavoid.problem import Array
+from qpavoid.safety.rollout import BackupPolicy, Start
 
 _HORIZONS = (0.2, 0.05, 0.5)
 """h of backup policies [s]: the most successful first."""
@@ -15,8 +18,25 @@ _BIAS_SPEEDS = (2.0, 30.0)
 """Range of ‖v̂‖ of the others, log-uniform [rad/s, m/s]: from a tie-break to full speed."""
 
 
+class Command(NamedTuple):
+    """What is commanded in a control step, as far as it is decided."""
+
+    v: Array
+    """(nv,)."""
+    after: Start
+    """State that it leads to."""
+    after_task: Start
+    """State that the velocity of the solver leads to."""
+    is_task: bool
+    """Whether it is the velocity of the solver."""
+
+    def to_task(self) -> Command:
+        """Return the velocity of the solver as the command."""
+        return Command(self.after_task.v, self.after_task, self.after_task, True)
+
+
 class BackupPolicies:
-    """A sequence of policies, the same after every `restart`."""
+    """Policies, each horizon without a bias and random ones by turns: the same after every `restart`."""
 
     def __init__(self, nv: int) -> None:
         """Begin the sequence, of policies for nv joints."""
