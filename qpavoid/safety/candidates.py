@@ -1,4 +1,4 @@
-"""What candidates for a backup trajectory begin with: what is commanded before them, and the policies that are tried."""
+"""What candidates for a backup trajectory begin with: what is commanded before them, and policies to try."""
 
 from __future__ import annotations
 
