@@ -18,7 +18,7 @@ from qpavoid.kernels.clearance import (
     joint_speeds,
     leaves_position_limits,
 )
-from qpavoid.kernels.contact_forces import ROWS_PER_POINT
+from qpavoid.kernels.contact_forces import ROWS_PER_POINT, make_orthonormal
 from qpavoid.kernels.contact_rows import contact_rows
 from qpavoid.kernels.depth import CellGrid, OwnBodies, fill_cells, mark_own_pixels, recall_cells
 from qpavoid.kernels.dynamics import (
@@ -129,6 +129,7 @@ __all__ = [
     "joint_speeds",
     "least_margin",
     "leaves_position_limits",
+    "make_orthonormal",
     "mark_own_pixels",
     "max_clearance_velocity",
     "minimize",
