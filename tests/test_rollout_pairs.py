@@ -32,8 +32,7 @@ class Walk:
         self.pairs = lay_out_pairs(self.query)
         self.samples = [Sample.at(place) for place in places]
         self.q, self.velocities = robot.home, self.rng.normal(size=(count, 6)) * [0.4, 0.4, 0.4, 1.0, 1.0, 1.0]
-        forget_pairs(self.pairs)
-        self.is_first = True
+        forget_pairs(self.query.packed, self.pairs)
 
     def advance(self, dt=0.01, speed=0.5):
         """Go on for dt, robot and obstacles."""
@@ -49,9 +48,8 @@ class Walk:
         self.kinematics.compute(self.q)
         self.query.place(states)
         kernels.place_bodies(self.query.packed, self.kinematics.joint_poses)
-        near_pairs_along(self.query.packed, self.pairs, states.which, self.is_first, INFLUENCE, PREFERRED)
+        near_pairs_along(self.query.packed, self.pairs, INFLUENCE, PREFERRED)
         self.query.finish()
-        self.is_first = False
         self.exact.place(states)
         self.exact.compute(self.kinematics.joint_poses, INFLUENCE)
         distances = np.full(len(self.scene.pairs), np.inf)
