@@ -92,3 +92,26 @@ def test_what_rests_is_computed_once():
     assert np.isinf(first[2]).all() and (first[1][:, 0] < INFLUENCE).any()
     again = set(rows[np.isinf(bounds)].tolist())
     assert again == set(first[0][near].tolist())
+
+
+@pytest.mark.parametrize("shapes", [SHAPES, CURVED], ids=["closed", "gjk"])
+def test_a_step_leaves_out_only_what_is_certainly_beyond(shapes):
+    """With margins that grow, too: what is nearer than the influence distance has the results of a search anew."""
+    walk, left_out = Walk(Robot.load("panda"), 5, shapes), 0
+    for k in range(60):
+        walk.advance(dt=0.004)
+        states = ObstacleStates.of(walk.samples, 1e-3 * k)
+        walk.kinematics.compute(walk.q)
+        for query, beyond in ((walk.query, INFLUENCE), (walk.exact, np.inf)):
+            query.place(states)
+            query.set_influence_distance(INFLUENCE)
+            kernels.place_bodies(query.packed, walk.kinematics.joint_poses)
+            kernels.near_pairs(query.packed, beyond)
+            query.finish()
+        x, every = walk.query.arrays, walk.exact.pairs
+        distances = walk.exact.arrays.results[every, 0] - walk.exact.arrays.margin[x.twist_row[every]]
+        near = every[distances < INFLUENCE]
+        assert set(near.tolist()) <= set(walk.query.pairs.tolist())
+        np.testing.assert_allclose(x.results[near, 0], walk.exact.arrays.results[near, 0], rtol=0, atol=1e-6)
+        left_out += len(every) - len(walk.query.pairs)
+    assert left_out > 100

@@ -158,7 +158,8 @@ class BackupPlanner:
         self.is_cut = False
         self._catch_up()
         is_same_scene = self._moving is self._obstacles.moving
-        is_near = len(self._obstacles.moving) > 0 and not self._approach.is_far(v, t)
+        lasts = self._lasting_steps > 0 and not len(self._obstacles.external)  # as `allows` takes it
+        is_near = len(self._obstacles.moving) > 0 and (lasts or not self._approach.is_far(v, t))
         if not (is_near and is_same_scene):
             self._forget()
         if not is_near:
