@@ -10,10 +10,13 @@ from qpavoid.kernels.contact_forces import (
     cone_rows,
     eliminate_base,
     force_torque_rows,
+    make_orthonormal,
     point_jacobians,
     standing_dynamics,
 )
-from qpavoid.kernels.orthogonal import factorise_rows, solve_rows
+from qpavoid.kernels.orthogonal import factorise_rows, solve_rows, split_space
+from qpavoid.kernels.qp import minimize
+from qpavoid.kernels.reduced_qp import project_within
 from qpavoid.model.kinematics import ForwardKinematics
 
 DT, SCALE = 1e-3, 0.03
@@ -90,7 +93,9 @@ def test_basis_and_right_inverse(standing):
     np.testing.assert_allclose(Y, np.linalg.pinv(B), atol=1e-12)
     np.testing.assert_allclose(B @ N, 0.0, atol=1e-13)
     np.testing.assert_allclose(N.T @ N, np.eye(18), atol=1e-13)
-    np.testing.assert_allclose(standing["X"].T @ standing["X"], np.eye(41), atol=1e-12)
+    X, own = standing["X"], make_orthonormal(standing["X"], *standing["Z"].shape)
+    np.testing.assert_allclose(own.T @ own, np.eye(41), atol=1e-12)
+    np.testing.assert_allclose(own @ own.T @ X, X, atol=1e-12)
     np.testing.assert_allclose(standing["J"] @ standing["Z"], 0.0, atol=1e-13)
     np.testing.assert_allclose(standing["J"] @ standing["rest"], standing["b"], atol=1e-13)
 
@@ -136,10 +141,47 @@ def test_whatever_is_free_the_base_equations_hold_and_torques_are_those_of_inver
         np.testing.assert_allclose(from_rows, torque[6:], atol=1e-3)  # rows keep a margin of 1e-7 in v
 
 
+def test_what_rows_do_not_move_is_left_as_it_is(standing):
+    """Two feet move 18 of 35 coordinates: K and Z together are orthonormal, and the arms are axes of Z."""
+    K, Z, _, _ = split_space(standing["J"])
+    whole = np.vstack((K, Z.T))
+    np.testing.assert_allclose(whole @ whole.T, np.eye(35), atol=1e-13)
+    np.testing.assert_allclose(standing["J"] - standing["J"] @ K.T @ K, 0.0, atol=1e-13)
+    still = ~standing["J"].any(axis=0)
+    assert still.sum() == 17
+    assert (np.sort(Z[still], axis=1)[:, -1] == 1.0).all() and (np.count_nonzero(Z[still], axis=1) == 1).all()
+
+
+def test_the_qp_within_contacts_and_base_is_that_of_all_velocities_and_impulses(standing):
+    """Against the same problem with orthonormal columns, all rows written out; to 1e-9."""
+    rng, X, start = np.random.default_rng(5), standing["X"], standing["start"]
+    (d, size), (n, k) = X.shape, standing["Z"].shape
+    own, far, binding = make_orthonormal(X, n, k), np.full(size, np.inf), 0
+    for _ in range(20):
+        target = start + X @ rng.normal(scale=0.1, size=size)
+        A, J, half = rng.normal(size=(9, n)), rng.normal(size=(4, n)), rng.normal(size=(5, d))
+        G = np.concatenate((np.stack((half, -half), axis=1).reshape(10, d), rng.normal(size=(6, d))))
+        b, g = J @ target[:n] + rng.normal(size=4), G @ start - 0.3
+        lower, upper = start[:n] - 0.3, start[:n] + 0.3
+        lower[rng.integers(n)] = upper[rng.integers(n)] = np.inf
+        lower[lower == np.inf] = -np.inf
+        x, is_solved = project_within(A, 1e-3, target, X, start, k, J, b, G, g, 10, lower, upper)
+        AX, JX, GX, V = A @ own[:n], J @ own[:n], G @ own, own[:n]
+        rows = np.vstack((JX, GX, V, -V))
+        rhs = np.concatenate((b - J @ start[:n], g - G @ start, lower - start[:n], start[:n] - upper))
+        finite, y = np.isfinite(rhs), own.T @ (target - start)
+        ours = np.ascontiguousarray(rows[finite]), rhs[finite]
+        assert is_solved == minimize(AX.T @ AX + 1e-3 * np.eye(size), y, *ours, -far, far, np.zeros(finite.sum()))
+        if is_solved:
+            np.testing.assert_allclose(x, start + own @ y, atol=1e-9)
+            binding += np.abs(rows @ y - rhs)[finite].min() < 1e-9
+    assert binding > 5
+
+
 def test_standing_dynamics_are_those_of_the_least_forces(standing):
     M, h, Z, n = standing["M"], standing["h"], standing["Z"], len(standing["h"])
     D, torque = np.empty((n, n)), np.empty(n)
-    standing_dynamics(M, h, standing["Jp"], standing["Y"], Z, D, torque)
+    standing_dynamics(M, h, standing["Jp"], standing["Y"], split_space(standing["J"])[0], D, torque)
     w = np.random.default_rng(2).normal(size=Z.shape[1])
     a = Z @ w
     f = np.linalg.pinv(standing["Jp"][:, :6].T) @ (M @ a + h)[:6]

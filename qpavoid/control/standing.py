@@ -88,6 +88,7 @@ class StandingDynamics(RobotDynamics):
             points += [np.array(corner) for corner in corners]
             owners += [i] * len(corners)
         self._points, self._owners = np.array(points), np.array(owners, dtype=np.intp)
+        self._corners = np.bincount(self._owners).tolist()
 
     def _find_actuated(self, robot: Robot) -> IntArray:
         """Return the coordinates (a,) with a motor: all but those of the base."""
@@ -171,7 +172,13 @@ class StandingDynamics(RobotDynamics):
         rows[:c, :n], right[:c] = stance.J, stance.b_approached
         rows[c:, :n], rows[c:, n:] = M, -stance.Jp[:, :BASE].T / _SCALE
         right[c:] = M @ v_measured - self._dt * self._bias[:BASE]
-        return Contacts(stance.X, stance.start, rows, right)
+        return Contacts(self._basis, stance.start, rows, right)
+
+    @property
+    def _basis(self) -> Array:
+        """Orthonormal columns of what contacts and base leave of x = (v, s p)."""
+        Z = self._stance.Z
+        return np.asarray(kernels.make_orthonormal(self._stance.X, *Z.shape))
 
     def _hard_rows(self, v_measured: Array) -> StepDynamics:
         """Return the dynamics of x = (v, s p), with the rows of torque limits and cones."""
@@ -277,12 +284,12 @@ class StandingDynamics(RobotDynamics):
             return self._limp(solution)
         if not self._is_settled:
             kernels.standing_torques(self.packed, self._packed_z, self._stance, v_measured, self._dt)
-        forces, owners = z.solved[n : n + m].reshape(-1, 3) / self._dt, self._owners[self._stance.used]
-        by_frame = {
-            contact.frame: forces[owners == i]
-            for i, contact in enumerate(self._contacts.settings)
-            if self._contacts.shares[i] > 0.0
-        }
+        forces, by_frame, at = z.solved[n : n + m].reshape(-1, 3) / self._dt, dict[str, Array](), 0
+        declared = zip(self._contacts.settings, self._contacts.shares, self._corners, strict=True)
+        for contact, fraction, corners in declared:
+            if fraction > 0.0:
+                by_frame[contact.frame] = forces[at : at + corners]
+                at += corners
         return solution._replace(
             v=z.solved[:n].copy(), torque=y.torque.copy(), acceleration=y.change.copy(), forces=by_frame
         )
@@ -291,7 +298,7 @@ class StandingDynamics(RobotDynamics):
         """Take the velocity nearest to v (nv,) that torques and cones allow; return whether there is one."""
         if not (stance := self._stance).is_held:
             return False
-        n, X, start = len(v), stance.X, stance.start
+        n, X, start = len(v), self._basis, stance.start
         target = X.T @ (self._with_impulses(self._approached.project(v)) - start)
         free = np.full(X.shape[1], np.inf)
         rows, rhs = stance.rows[: stance.hard], stance.rhs[: stance.hard]

@@ -7,16 +7,15 @@ solved for p by a right inverse Y of B and a basis N of its null space, so that 
 
     p = Y (M_b (rest - v̄) + dt h_b) + Y M_b Z w + N u
 
-A solver sees x = (v, s p) = start + X y with `scale` s, since impulses weigh less than velocities. The columns of X are
-orthonormal: those of N are so, and orthogonal to those of Y; those of (Z, s Y M_b Z) become so by a Cholesky
-factor.
+A solver sees x = (v, s p) = start + X y with `scale` s, since impulses weigh less than velocities. Those columns of X
+that belong to u are orthonormal, and orthogonal to all of Y, so that XᵀX is 1 + s² (Y M_b Z)ᵀ Y M_b Z of w, and 1 of u.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-from qpavoid.kernels.cholesky import factorise
+from qpavoid.kernels.cholesky import dot, factorise
 from qpavoid.kernels.orthogonal import factorise_rows
 from qpavoid.kernels.packing import compiled
 from qpavoid.problem import Array, IntArray
@@ -64,7 +63,7 @@ def eliminate_base(
         Z: (n, k) basis of the velocities that move no contact.
         rest: (n,) velocity that meets the contacts.
         scale: s.
-        X: (n + m, k + m - 6) out, its columns orthonormal; the last m - 6 move no coordinate.
+        X: (n + m, k + m - 6) out; its last m - 6 columns, orthonormal, move no coordinate; see `make_orthonormal`.
         start: (n + m,) out.
         Y: (m, 6) out: right inverse of B.
         N: (m, m - 6) out: orthonormal basis of the forces that do not move the base.
@@ -114,69 +113,79 @@ def eliminate_base(
             for c in range(k):
                 X[n + j, c] += weight * moving[i, c]
         start[n + j] = total
-    _make_orthonormal(X, n, k)
     return True
 
 
 @compiled
-def _make_orthonormal(X: Array, n: int, k: int) -> None:
-    """Make the first k columns of X orthonormal, of which the first n rows are."""
-    G, L = np.zeros((k, k)), np.empty((k, k))
-    for r in range(n, len(X)):
+def add_gram(X: Array, first: int, k: int, weight: float, G: Array) -> None:
+    """Add weight · XᵀX, of the rows of X from `first` on and its first k columns, to the lower triangle of G."""
+    for r in range(first, len(X)):
         for i in range(k):
             for c in range(i + 1):
-                G[i, c] += X[r, i] * X[r, c]
-    for i in range(k):
-        G[i, i] += 1.0
-    factorise(G, L, k)
-    for r in range(len(X)):
-        for i in range(k):
-            total = X[r, i]
-            for c in range(i):
-                total -= L[i, c] * X[r, c]
-            X[r, i] = total * L[i, i]
+                G[i, c] += weight * X[r, i] * X[r, c]
 
 
 @compiled
-def standing_dynamics(M: Array, h: Array, Jp: Array, Y: Array, Z: Array, M_own: Array, h_own: Array) -> None:
+def make_orthonormal(X: Array, n: int, k: int) -> Array:
+    """Compute X with its first k columns made orthonormal, of which the first n rows are."""
+    G, L, own = np.zeros((k, k)), np.empty((k, k)), X.copy()
+    add_gram(X, n, k, 1.0, G)
+    for i in range(k):
+        G[i, i] += 1.0
+    factorise(G, L, k)
+    for r in range(len(own)):
+        for i in range(k):
+            total = own[r, i]
+            for c in range(i):
+                total -= L[i, c] * own[r, c]
+            own[r, i] = total * L[i, i]
+    return own
+
+
+@compiled
+def standing_dynamics(M: Array, h: Array, Jp: Array, Y: Array, K: Array, M_own: Array, h_own: Array) -> None:
     """Write the dynamics of the joints where contacts hold, with the least forces that the base needs.
 
-    τ = D a + τ_rest with D = S M Z Zᵀ and τ_rest = S h, where S = (-Jc_aᵀ Y, 1) takes over what the base needs.
+    τ = D a + τ_rest with D = S M (1 - Kᵀ K) and τ_rest = S h, where S = (-Jc_aᵀ Y, 1) takes over what the base needs.
 
     Args:
         M: (n, n) mass matrix.
         h: (n,) bias torques [Nm or N].
         Jp: (m, n) Jacobian of the contact points.
         Y: (m, 6) see `eliminate_base`.
-        Z: (n, k) see `eliminate_base`.
+        K: (r, n) orthonormal basis of the rows of the contacts, see `split_space`.
         M_own: (n, n) out: D, below six rows of zero.
         h_own: (n,) out: τ_rest, behind six zeros [Nm or N].
     """
-    n, k = Z.shape
+    n, weights = K.shape[1], np.empty(BASE)
     M_own[:BASE], h_own[:BASE] = 0.0, 0.0
-    weights, row, inner = np.empty(BASE), np.empty(n), np.empty(k)
     for i in range(BASE, n):
-        for b in range(BASE):
-            weights[b] = 0.0
+        weights[:] = 0.0
         for j in range(len(Jp)):
-            for b in range(BASE):
-                weights[b] += Jp[j, i] * Y[j, b]
+            if Jp[j, i] != 0.0:  # arms move no contact
+                for b in range(BASE):
+                    weights[b] += Jp[j, i] * Y[j, b]
         h_own[i] = h[i]
         for c in range(n):
-            row[c] = M[i, c]
+            M_own[i, c] = M[i, c]
         for b in range(BASE):
-            h_own[i] -= weights[b] * h[b]
-            for c in range(n):
-                row[c] -= weights[b] * M[b, c]
-        inner[:] = 0.0
-        for j in range(n):
-            for c in range(k):
-                inner[c] += row[j] * Z[j, c]
-        for j in range(n):
-            total = 0.0
-            for c in range(k):
-                total += inner[c] * Z[j, c]
-            M_own[i, j] = total
+            if weights[b] != 0.0:
+                h_own[i] -= weights[b] * h[b]
+                for c in range(n):
+                    M_own[i, c] -= weights[b] * M[b, c]
+        remove_parts(M_own[i], K)
+
+
+@compiled
+def remove_parts(row: Array, K: Array) -> None:
+    """Remove from a row (n,) what it has of the orthonormal ones of K (r, n)."""
+    parts = np.empty(len(K))
+    for k in range(len(K)):
+        parts[k] = dot(row, K[k])
+    for k in range(len(K)):
+        if parts[k] != 0.0:
+            for c in range(len(row)):
+                row[c] -= parts[k] * K[k, c]
 
 
 @compiled

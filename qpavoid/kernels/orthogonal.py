@@ -86,16 +86,50 @@ def solve_rows(J: Array, b: Array) -> tuple[Array, Array]:
     Returns:
         Orthonormal basis (n, k) of the null space of J, the least v (n,).
     """
-    c, n = J.shape
-    Q, R, order = np.empty((n, n)), np.empty((n, c)), np.empty(c, dtype=np.intp)
-    rank = factorise_rows(J, Q, R, order)
-    return Q[:, rank:].copy(), least_solution(Q, R, order, rank, b)
+    K, Z, R, order = split_space(J)
+    return Z, least_solution(K, R, order, b)
 
 
 @compiled
-def least_solution(Q: Array, R: Array, order: IntArray, rank: int, b: Array) -> Array:
-    """Compute the least v (n,) with J v = b (c,), from the factors of J; see `factorise_rows`."""
-    n = len(Q)
+def split_space(J: Array) -> tuple[Array, Array, Array, IntArray]:
+    """Split the space of v by rows J (c, n); what they do not move, as arms on two feet, costs no work.
+
+    Returns:
+        Orthonormal bases K (rank, n) of the rows and Z (n, n - rank) of their null space, R and `order` of
+        `factorise_rows`.
+    """
+    c, n = J.shape
+    moved, m = np.empty(n, dtype=np.intp), 0
+    for j in range(n):
+        is_moved = False
+        for r in range(c):
+            is_moved |= J[r, j] != 0.0
+        if is_moved:
+            moved[m] = j
+            m += 1
+    own, Q, R, order = np.empty((c, m)), np.empty((m, m)), np.empty((m, c)), np.empty(c, dtype=np.intp)
+    for r in range(c):
+        for i in range(m):
+            own[r, i] = J[r, moved[i]]
+    rank = factorise_rows(own, Q, R, order)
+    K, Z, free, at = np.zeros((rank, n)), np.zeros((n, n - rank)), m - rank, 0
+    for i in range(m):
+        for k in range(rank):
+            K[k, moved[i]] = Q[i, k]
+        for k in range(free):
+            Z[moved[i], k] = Q[i, rank + k]
+    for j in range(n):
+        if at < m and moved[at] == j:
+            at += 1
+        else:
+            Z[j, free + j - at] = 1.0
+    return K, Z, R, order
+
+
+@compiled
+def least_solution(K: Array, R: Array, order: IntArray, b: Array) -> Array:
+    """Compute the least v (n,) with J v = b (c,); see `split_space`."""
+    rank, n = K.shape
     v, y = np.zeros(n), np.empty(rank)
     for i in range(rank):
         total = b[order[i]]
@@ -103,5 +137,5 @@ def least_solution(Q: Array, R: Array, order: IntArray, rank: int, b: Array) -> 
             total -= R[k, i] * y[k]
         y[i] = total / R[i, i]
         for k in range(n):
-            v[k] += Q[k, i] * y[i]
+            v[k] += K[i, k] * y[i]
     return v

@@ -11,6 +11,7 @@ import numpy as np
 
 from qpavoid.kernels.balance_rows import balance_rows
 from qpavoid.kernels.bounds import OUTSIDE, velocity_bounds
+from qpavoid.kernels.cholesky import dot
 from qpavoid.kernels.contact_forces import (
     BASE,
     ROWS_PER_POINT,
@@ -18,11 +19,12 @@ from qpavoid.kernels.contact_forces import (
     eliminate_base,
     force_torque_rows,
     point_jacobians,
+    remove_parts,
     standing_dynamics,
 )
 from qpavoid.kernels.contact_rows import contact_rows
 from qpavoid.kernels.dynamics_rows import admit_stop, approached_rows, scale_braking
-from qpavoid.kernels.orthogonal import factorise_rows, least_solution
+from qpavoid.kernels.orthogonal import least_solution, split_space
 from qpavoid.kernels.packing import compiled
 from qpavoid.kernels.reduced_qp import project_within
 from qpavoid.kernels.standing_layout import Stance
@@ -55,6 +57,7 @@ def standing_step(
     scale_braking(x, y)
     margin, bent = velocity_bounds(x, q), 0.0
     admit_stop(x, y)
+    _admit_contacts(x, stance)
     if from_tasks:
         frame_rows(x)
         bent = _track_within(x, stance)
@@ -72,25 +75,23 @@ def standing_step(
     s.rows, s.violation, s.is_clear, s.position_margin, s.bent = k, worst, False, margin, bent
     if x.regularization == 0.0 or not stance.is_held or margin < -OUTSIDE or is_too_near(x, k):
         return UNSETTLED, stance
-    code = _solve(x, z, stance, k, from_tasks, max(x.regularization, bent))
+    code = _solve(x, y, z, stance, k, from_tasks, max(x.regularization, bent))
     if code == SETTLED:
         standing_torques(y, z, stance, x.v_prev, x.dt)
     return code, stance
 
 
 @compiled
-def _solve(x: Any, z: Any, stance: Any, k: int, from_tasks: bool, regularization: float) -> int:
+def _solve(x: Any, y: Any, z: Any, stance: Stance, k: int, from_tasks: bool, regularization: float) -> int:
     """Write v and z.solved: the tracked velocity with impulses, or the QP in what contacts and base leave."""
-    n, m, used = len(x.v_prev), len(stance.Jp), len(stance.rhs)
-    lower, upper = np.full(n + m, -np.inf), np.full(n + m, np.inf)
-    G, g = np.zeros((k + used, n + m)), np.empty(k + used)
-    lower[:n], upper[:n] = x.lower, x.upper
-    G[:k, :n], g[:k] = x.J[:k], x.rhs[:k]
-    G[k:], g[k:] = stance.rows, stance.rhs
+    n, m, s = len(x.v_prev), len(stance.Jp), x.summary[0]
     tracked = with_impulses(z, stance, x.v_prev, x.dt, x.v_tracking)
-    if not violation(tracked, G, g, lower, upper) <= 0.0:
-        A = x.A if from_tasks else x.identity
-        tracked, is_solved = project_within(A, regularization, tracked, stance.X, stance.start, G, g, lower, upper)
+    free = np.full(n + m, np.inf)
+    if not (s.violation <= 0.0 and violation(tracked, stance.rows, stance.rhs, -free, free) <= 0.0):
+        tracked, is_solved = project_within(
+            x.A if from_tasks else x.identity, regularization, tracked, stance.X, stance.start, stance.Z.shape[1],
+            x.J[:k], x.rhs[:k], stance.rows, stance.rhs, 2 * len(y.limit) if y.has_torques else 0, x.lower, x.upper,
+        )  # fmt: skip
         if not is_solved:
             return UNSETTLED
     x.v[:] = tracked[:n]
@@ -118,16 +119,14 @@ def stand(x: Any, y: Any, z: Any) -> Stance:
         z.shares, z.jacobians,
     )  # fmt: skip
     c = len(b)
-    Q, R, order = np.empty((n, n)), np.empty((n, c)), np.empty(c, dtype=np.intp)
-    rank = factorise_rows(J, Q, R, order)
-    Z, approaching = Q[:, rank:].copy(), np.empty(c)
+    K, Z, R, order = split_space(J)
+    approaching = np.empty(c)
     for r in range(c):
         rate, contact = 0.0, of_rows[r]
         for j in range(n):
             rate += J[r, j] * v[j]
         approaching[r] = rate + z.steps[contact] * z.shares[contact] * (b[r] - rate)
-    resting = least_solution(Q, R, order, rank, b)
-    approached = least_solution(Q, R, order, rank, approaching)
+    resting, approached = least_solution(K, R, order, b), least_solution(K, R, order, approaching)
     used, Jp, normals, friction, least, most = _points(x, z)
     m, k = len(Jp), Z.shape[1]
     X, start, Y = np.empty((n + m, max(k + m - BASE, 0))), np.empty(n + m), np.empty((m, BASE))
@@ -138,7 +137,7 @@ def stand(x: Any, y: Any, z: Any) -> Stance:
     support, right = balance_rows(_bearing_points(x, z, used), x, y, z)
     rows, rhs = np.zeros((hard + len(right), n + m)), np.empty(hard + len(right))
     if is_held:
-        standing_dynamics(z.mass, z.bias, Jp, Y, Z, y.M, y.h)
+        standing_dynamics(z.mass, z.bias, Jp, Y, K, y.M, y.h)
         if y.has_torques:
             force_torque_rows(z.mass, z.bias, v, dt, Jp, y.limit, z.scale, rows[:torques], rhs[:torques])
         cone_rows(normals, friction, least, most, dt, z.scale, n, rows[torques:hard], rhs[torques:hard])
@@ -146,7 +145,9 @@ def stand(x: Any, y: Any, z: Any) -> Stance:
     else:
         y.M[:BASE], y.h[:BASE] = 0.0, 0.0
         y.M[BASE:], y.h[BASE:] = z.mass[BASE:], z.bias[BASE:]
-    return Stance(J, b, approaching, Z, resting, approached, used, Jp, normals, X, start, Y, rows, rhs, hard, is_held)
+    return Stance(
+        J, b, approaching, K, Z, resting, approached, used, Jp, normals, X, start, Y, rows, rhs, hard, is_held
+    )
 
 
 @compiled
@@ -192,21 +193,22 @@ def _bearing_points(x: Any, z: Any, used: IntArray) -> Array:
 
 
 @compiled
+def _admit_contacts(x: Any, stance: Any) -> None:
+    """Let the hard bounds admit the stop as far as contacts do: a foot that comes may have to go on at its speed."""
+    stop = x.v_stop.copy()
+    _meet(stance.J, stance.b_approached, stance.Z, stance.approached, stop, 0.0)
+    for j in range(len(stop)):
+        x.hard_lower[j], x.hard_upper[j] = min(x.hard_lower[j], stop[j]), max(x.hard_upper[j], stop[j])
+
+
+@compiled
 def _track_within(x: Any, stance: Any) -> float:
     """Let the tracking law hold the contacts; return how far the task rows bend."""
-    (rows, n), Z, resting = x.A.shape, stance.Z, stance.resting
-    A, missing, inner = np.zeros((rows, n)), x.b.copy(), np.empty(Z.shape[1])
+    (rows, n), resting = x.A.shape, stance.resting
+    A, missing = x.A.copy(), x.b.copy()
     for r in range(rows):
-        inner[:] = 0.0
-        for j in range(n):
-            entry = x.A[r, j]
-            if entry != 0.0:  # a posture has one of them in a row
-                missing[r] -= entry * resting[j]
-                for c in range(len(inner)):
-                    inner[c] += entry * Z[j, c]
-        for j in range(n):
-            for c in range(len(inner)):
-                A[r, j] += Z[j, c] * inner[c]
+        missing[r] -= dot(A[r], resting)
+        remove_parts(A[r], stance.K)
     bent = tracking_law(x, A, missing, x.v_tracking, x.b_feasible)
     for j in range(n):
         x.v_tracking[j] += resting[j]

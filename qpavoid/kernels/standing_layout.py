@@ -65,8 +65,10 @@ class Stance(NamedTuple):
     """(c,) velocity that brings them to where they rest [m/s, rad/s]."""
     b_approached: Array
     """(c,) the part of it that this step makes, from the measured velocity on."""
+    K: Array
+    """(·, n) orthonormal basis of these rows."""
     Z: Array
-    """(n, ·) basis of what they leave."""
+    """(n, ·) orthonormal basis of what they leave."""
     resting: Array
     """(n,) least v with J v = b."""
     approached: Array
@@ -78,7 +80,7 @@ class Stance(NamedTuple):
     normals: Array
     """(m / 3, 3) direction in which the ground pushes, world."""
     X: Array
-    """(n + m, ·)."""
+    """(n + m, ·); not orthonormal, see `make_orthonormal`."""
     start: Array
     """(n + m,)."""
     Y: Array

@@ -34,7 +34,8 @@ def scale_straight(x: Any, A: Array, b: Array) -> None:
 def bent_directions(S: Array, B: Array, squares: Array, G: Array, curvatures: Array) -> Array:
     """Compute γ_k n_kᵀ (s, n) of G on what the rows S move of the null space of the v_i.
 
-    With an orthonormal basis Q of that, the rows of Q G Qᵀ, made orthogonal, are γ_k times its eigenvectors.
+    With an orthonormal basis Q of that, by Gram and Schmidt with the largest row first, the rows of Q G Qᵀ, made
+    orthogonal, are γ_k times its eigenvectors.
 
     Args:
         S: (s, n).
@@ -52,24 +53,52 @@ def bent_directions(S: Array, B: Array, squares: Array, G: Array, curvatures: Ar
                 along = dot(Q[r], B[i]) / squares[i]
                 for c in range(nv):
                     Q[r, c] -= along * B[i, c]
-    orthogonalise(Q, curvatures)
-    for r in range(count):
-        length = np.sqrt(curvatures[r]) if curvatures[r] > _ROUND_OFF * size else np.inf
-        for c in range(nv):
-            Q[r, c] /= length
-    H, directions, turned = np.empty((count, count)), np.zeros((count, nv)), np.empty(nv)
-    for r in range(count):
+    rank = _orthonormalise(Q, _ROUND_OFF * size)
+    H, directions, turned = np.empty((rank, rank)), np.zeros((count, nv)), np.empty(nv)
+    for r in range(rank):
         for c in range(nv):
             turned[c] = dot(G[c], Q[r])
-        for k in range(count):
+        for k in range(rank):
             H[r, k] = dot(Q[k], turned)
-    orthogonalise(H, curvatures)
-    for r in range(count):
+    curvatures[:] = 0.0
+    orthogonalise(H, curvatures[:rank])
+    for r in range(rank):
         curvatures[r] = np.sqrt(curvatures[r])
-        for k in range(count):
+        for k in range(rank):
             for c in range(nv):
                 directions[r, c] += H[r, k] * Q[k, c]
     return directions
+
+
+@compiled
+def _orthonormalise(Q: Array, least: float) -> int:
+    """Turn the first rows of Q (c, n) into an orthonormal basis of all rows; return how many those are.
+
+    Rows count whose square exceeds `least` in what the rows before them leave.
+    """
+    count, nv = Q.shape
+    for rank in range(count):
+        best, largest = rank, 0.0
+        for r in range(rank, count):
+            square = dot(Q[r], Q[r])
+            if square > largest:
+                best, largest = r, square
+        if not largest > least:
+            return rank
+        for c in range(nv):
+            Q[rank, c], Q[best, c] = Q[best, c], Q[rank, c]
+        for i in range(rank):  # once more: what is left may be small
+            along = dot(Q[rank], Q[i])
+            for c in range(nv):
+                Q[rank, c] -= along * Q[i, c]
+        length = np.sqrt(dot(Q[rank], Q[rank]))
+        for c in range(nv):
+            Q[rank, c] /= length
+        for r in range(rank + 1, count):
+            along = dot(Q[r], Q[rank])
+            for c in range(nv):
+                Q[r, c] -= along * Q[rank, c]
+    return count
 
 
 @compiled
