@@ -19,7 +19,8 @@ film: .venv/dev
 	$(BIN)/qpavoid render panda_ball --gif docs/figures/panda_ball.gif
 
 test: .venv/dev
-	$(BIN)/pytest -n auto --dist loadfile
+	$(BIN)/qpavoid warmup  # once, and not in each of the processes
+	$(BIN)/pytest -n $$(($$(nproc) + 1)) --dist loadfile  # one more than processors: some tests wait for others
 
 campaign: .venv/dev
 	$(BIN)/pytest -n auto -m slow

@@ -3,24 +3,23 @@
 from __future__ import annotations
 
 import re
-import sys
 from pathlib import Path
 from typing import Any
 
 _FIELD = re.compile(r'^    (\w+): [^\n]*\n    """(.*?)"""', re.MULTILINE | re.DOTALL)
 
 
-def document_fields(*classes: Any) -> None:
-    """Give the fields of named tuples the docstrings that their source has; Python says `Alias for field number 5`.
+def document_fields(named_tuple: Any, file: str | None) -> None:
+    """Give the fields of a named tuple the docstrings that its source has; Python says `Alias for field number 5`.
 
     Args:
-        classes: named tuples; of one whose source is not at hand, nothing changes.
+        named_tuple: the class; if its source is not at hand, nothing changes.
+        file: the file that defines it.
     """
-    for each in classes:
-        try:
-            source = Path(sys.modules[each.__module__].__file__ or "").read_text(encoding="utf-8")
-        except (OSError, UnicodeError):
-            continue
-        _, _, body = source.partition(f"\nclass {each.__name__}(NamedTuple):\n")
-        for name, text in _FIELD.findall(body.partition("\n\n\n")[0]):
-            getattr(each, name).__doc__ = " ".join(text.split())
+    try:
+        source = Path(file or "").read_text(encoding="utf-8")
+    except (OSError, UnicodeError):
+        return
+    _, _, body = source.partition(f"\nclass {named_tuple.__name__}(NamedTuple):\n")
+    for name, text in _FIELD.findall(body.partition("\n\n\n")[0]):
+        getattr(named_tuple, name).__doc__ = " ".join(text.split())

@@ -93,6 +93,15 @@ def test_backup_leaves_closing_obstacles_in_time_and_reports_it(tmp_path, accele
         assert np.abs(np.diff(v, axis=0, prepend=0.0)).max() / DT <= acceleration + 1e-6
 
 
+def test_a_step_does_bit_for_bit_what_a_tick_does(tmp_path):
+    """A step takes short ways where a backup trajectory stays valid; a tick does not."""
+    balls = [*closing_balls(), on_line("passing", Sphere(radius=0.2), (-1.5, 0.7, 0.0), (1.5, 0.7, 0.0), 0.6)]
+    short, full = (controller_of(tmp_path, balls, acceleration=2.0) for _ in range(2))
+    for k, (q, solution) in enumerate(loop(short, 280)):
+        tick = full.tick(q, k * DT, TARGET)
+        assert tick.solution.v.tobytes() == solution.v.tobytes() and tick.solution.reasons == solution.reasons
+
+
 @pytest.mark.parametrize("filtered", [False, True])
 def test_without_backup_they_trap_the_robot(tmp_path, filtered):
     """So does a command of rest, which is filtered; with a backup trajectory that is left in time, too."""

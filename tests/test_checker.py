@@ -338,6 +338,7 @@ def test_backup_evades_closing_obstacles(seed):
     assert not findings.contacts
 
 
+@pytest.mark.slow
 def test_backup_avoids_contacts_beside_unavoidable_one():
     """A pair that touches in every rollout must not make the planner ignore the other pairs."""
     findings, verdict = run_and_judge(recorded_case(1084), "qp")

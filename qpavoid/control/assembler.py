@@ -60,7 +60,8 @@ class RowAssembler(TrackedVelocities):
         x = self._layout = lay_out(settings, frames, row_tasks, self._forward, self.query)
         is_hard = limits.relax_acceleration or settings.dynamics is not None
         self._hard = (x.hard_lower, x.hard_upper) if is_hard else (x.lower, x.upper)
-        self._packed: Any = kernels.pack(x)
+        self.packed: Any = kernels.pack(x)
+        """Memory of the control step in compiled code, see `RowLayout`."""
         self.dynamics = settings.dynamics
         own = None if self.dynamics is None else self.dynamics.contacts
         self.contacts = self._contacts = own or (None if contacts is None else contacts.own_copy())
@@ -72,7 +73,7 @@ class RowAssembler(TrackedVelocities):
         """Name and unit of each coordinate."""
         self.previous = PreviousVelocity(x, contacts is not None and self.dynamics is None)
         """Velocity at which the robot moves when a step begins."""
-        self._stops = JerkStops(x, self._packed) if x.jerk_limited else None
+        self._stops = JerkStops(x, self.packed) if x.jerk_limited else None
         self.targets = x.targets
         """(f, 18) states that the frame tasks are to reach, see `trajectories`; to be written before `compute`."""
         self._tracking, levels = Tracking(x.A, x.b, x.b_feasible), task_levels(frames, row_tasks)
@@ -96,8 +97,8 @@ class RowAssembler(TrackedVelocities):
         self.follows_tasks = True
         """Whether the step is of the tasks, or of a velocity that is given."""
         self._contact_rows: Contacts | None = None
-        self._find = kernels.direct(kernels.find_near_pairs, self._packed, self.q)
-        self._forms = [_Form(x, self._packed, {})]
+        self._find = kernels.direct(kernels.find_near_pairs, self.packed, self.q, self.influence_distance)
+        self._forms = [_Form(x, self.packed, {})]
         self._step = self._load_step()
         self.use_form(0)
         self.kinematics = Kinematics(x.J_world, x.poses)
@@ -144,12 +145,12 @@ class RowAssembler(TrackedVelocities):
 
     def use_form(self, number: int) -> None:
         """Choose the form of the rows of the next steps; 0 is that of the settings."""
-        self._layout, self._packed, self._views = self._forms[number]
+        self._layout, self.packed, self._views = self._forms[number]
         self._row_count = self._layout.summary.view(np.ndarray)["rows"]
 
     def _load_step(self) -> Callable[..., int]:
         """Return the code of `kernels.control_step` for all forms, which runs once now: it leaves guesses behind."""
-        arguments = self._packed, self.q, self.influence_distance, False, True, False
+        arguments = self.packed, self.q, self.influence_distance, False, True, False
         if self.dynamics is not None:
             return self.dynamics.step(*arguments)
         return kernels.direct(kernels.control_step, *arguments)
@@ -186,7 +187,7 @@ class RowAssembler(TrackedVelocities):
     def run(self) -> bool:
         """Compute a step at `q` in one call, but for pairs whose cores meet; return what `compute` does."""
         moving, from_tasks = self.query.is_moving, self.follows_tasks
-        code = self._step(self._packed, self.q, self.influence_distance, moving, from_tasks, False)
+        code = self._step(self.packed, self.q, self.influence_distance, moving, from_tasks, False)
         if code != TO_MEASURE:
             return code == SETTLED
         self.query.finish()
@@ -207,7 +208,7 @@ class RowAssembler(TrackedVelocities):
     def _finish(self) -> bool:
         """Compute a step whose kinematics and distances are up to date."""
         arguments = self.query.is_moving, self.follows_tasks, True
-        code = self._step(self._packed, self.q, self.influence_distance, *arguments)
+        code = self._step(self.packed, self.q, self.influence_distance, *arguments)
         if self._contact_rows is not None:
             self._hold(self._contact_rows)
         return code == SETTLED
@@ -215,7 +216,7 @@ class RowAssembler(TrackedVelocities):
     def _measure(self) -> None:
         """Compute kinematics and distances."""
         if self._finds_pairs:
-            self._find(self._packed, self.q)
+            self._find(self.packed, self.q, self.influence_distance)
             self.query.finish()
         else:
             self._forward.compute(self.q)
@@ -252,15 +253,15 @@ class RowAssembler(TrackedVelocities):
         self.previous.tighten_bounds()
         if x.task_switching:
             summary.bent = 0.0
-            kernels.row_bounds(self._packed, summary.rows, self.query.is_moving)
-        summary.violation = kernels.tracking_violation(self._packed, summary.rows)
+            kernels.row_bounds(self.packed, summary.rows, self.query.is_moving)
+        summary.violation = kernels.tracking_violation(self.packed, summary.rows)
 
     def _track_within(self, contacts: Contacts) -> float:
         """Let the tracking law hold the contacts; return how far the task rows bend."""
         x, v_particular = self._layout, contacts.v_particular
         missing = x.b - x.A @ v_particular
         A = x.A @ contacts.Z @ contacts.Z.T
-        bent = float(kernels.tracking_law(self._packed, A, missing, x.v_tracking, x.b_feasible))
+        bent = float(kernels.tracking_law(self.packed, A, missing, x.v_tracking, x.b_feasible))
         x.v_tracking[:] += v_particular
         x.b_feasible[:] += x.A @ v_particular
         return bent
@@ -285,7 +286,7 @@ class RowAssembler(TrackedVelocities):
             horizon: time for which v leads on [s].
             stop: what else there is of the path, with jerk limits.
         """
-        bound = float(kernels.clearance_lower_bound(self._packed, v, near, self.influence_distance, horizon))
+        bound = float(kernels.clearance_lower_bound(self.packed, v, near, self.influence_distance, horizon))
         if stop is None or self._stops is None:
             return bound
         return bound - self._stops.clearance_lost(stop, v, horizon)
@@ -298,7 +299,7 @@ class RowAssembler(TrackedVelocities):
             v: velocity (nv,).
             horizon: time for which v leads on [s].
         """
-        return bool(kernels.leaves_position_limits(self._packed, q, v, horizon))
+        return bool(kernels.leaves_position_limits(self.packed, q, v, horizon))
 
     def _view(self) -> tuple[Proximity, AvoidanceRows]:
         """Return what there is of the near pairs of the last step."""

@@ -150,13 +150,17 @@ class ProblemBuilder:
             return None
         if self._budget.is_limited:
             self._budget.begin()
-        update = self.tracker.read(now, obstacles)
+        rows = self.rows
+        follows = obstacles is None and self.tracker.follows_trajectories and not rows.query.has_planes
+        update = None if follows else self.tracker.read(now, obstacles)
         if not self._take_usual(q, *self._usual_arguments):
             return None
-        self._thread, self._targets.last, step, rows = get_ident(), samples, self._step, self.rows
+        self._thread, self._targets.last, step = get_ident(), samples, self._step
         self._clock.set(now)
         step.q, step.t, step.resumed, step.targets, step.faults, step.assumptions = rows.q, now, False, samples, (), ()
-        if update is not None:
+        if follows:
+            self.tracker.follow(now, rows.query)
+        elif update is not None:
             step.assumptions, step.faults = self._place(update)
         rows.follows_tasks = True
         step.is_settled = rows.run()

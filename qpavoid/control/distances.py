@@ -59,6 +59,8 @@ class DistanceQuery:
         )
         """(o,) distance from each obstacle's origin to its farthest point; infinite of a half-space [m]."""
         self._planes = np.flatnonzero(np.isinf(self.obstacle_radii)).tolist()
+        self.has_planes = bool(self._planes)
+        """Whether any obstacle is a half-space, whose extent counts from where the robot is."""
         bodies, pairs = len(table.spheres), len(scene.pairs)
         rows = obstacles + 1 + scene.movable - len(scene.body_names)
         self.arrays = kernels.DistanceArrays(
@@ -82,6 +84,9 @@ class DistanceQuery:
             speeds=np.zeros(model.njoints + obstacles),
             poses=read_poses(self._data.oMg),
             centers=np.ones((bodies, 5)),
+            radius=table.spheres[:, 3].copy(),
+            travels=np.zeros(bodies),
+            limits=np.full(pairs, -np.inf),
             guesses=np.zeros((pairs, GUESS)),
             near=np.zeros(pairs, dtype=np.intp),
             rows=np.zeros(pairs, dtype=np.intp),
@@ -160,21 +165,21 @@ class DistanceQuery:
 
     def forget_guesses(self) -> None:
         """Let all searches start anew, not where they ended before: of curved shapes, that shows."""
-        self.arrays.guesses[:] = 0.0
+        self.arrays.guesses[:], self.arrays.limits[:] = 0.0, -np.inf
         for pair in self._by_coal.tolist():
             self._data.distanceRequests[pair].updateGuess(_FIRST_GUESS)
 
     def update_slot(self, index: int) -> None:
         """Take over what the scene and the table have in a spare slot now; it is where it is at time 0."""
         x, body, obstacle = self.arrays, int(self.table.first[index]), self._scene.slots[index]
-        x.local[body], radius = self.table.spheres[body, :3], self.table.spheres[body, 3]
-        self.obstacle_radii[index] = x.bounding_radius[index] = np.linalg.norm(x.local[body]) + radius
+        x.local[body], x.radius[body] = self.table.spheres[body, :3], self.table.spheres[body, 3]
+        self.obstacle_radii[index] = x.bounding_radius[index] = np.linalg.norm(x.local[body]) + x.radius[body]
         self._uncertainty[index] = obstacle.uncertainty
         self._set_max_square(slice(body, body + 1), slice(None))
         self._set_max_square(slice(None), slice(body, body + 1))
         pairs = self.table.pairs_of(index)
         self._outdated |= pairs
-        x.guesses[pairs] = 0.0
+        x.guesses[pairs], x.limits[pairs] = 0.0, -np.inf
         self._last_near = b""
         x.states[index] = obstacle.motion.sample(0.0).row
         kernels.place_obstacles(self.packed, np.array([index]), x.states, self._uncertainty)
@@ -192,7 +197,7 @@ class DistanceQuery:
         kernels.place_bodies(self.packed, joint_poses)
         for index, cloud in self._clouds.items():
             self._place_proxies(index, cloud)
-        kernels.near_pairs(self.packed)
+        kernels.near_pairs(self.packed, np.inf)
         self.finish()
 
     def finish(self) -> None:

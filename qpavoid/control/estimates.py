@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from math import inf, nan
+from typing import Any
 
 import numpy as np
 
@@ -60,12 +62,20 @@ class MeasuredStates:
             max_speed=FASTEST,
         )
         self._packed = kernels.pack(self.arrays)
+        self._follow: Callable[..., bool] | None = None
         self.known: dict[int, None] = {}
         """Numbers of the obstacles that are given, in the order in which they first were."""
         for columns in (STATE, POSE, QUATERNION):  # the same code
             rows = np.zeros((0, columns))
             self._check = kernels.direct(kernels.check_updates, self._packed, _NONE, rows, _NONE)
         self._observe = kernels.direct(kernels.observe, self._packed, 0.0, _NONE, _NONE, _NO_STAMPS, _NONE)
+
+    def follow_trajectories(self, t: float, which: IntArray, distances: Any) -> bool:
+        """Bring all obstacles to t [s], and place some (k,); see `kernels.follow_trajectories`."""
+        arguments = self._packed, distances, t, which
+        if self._follow is None:
+            self._follow = kernels.direct(kernels.follow_trajectories, *arguments)
+        return bool(self._follow(*arguments))
 
     def follow(self, pieces: Pieces) -> None:
         """Let obstacles follow other trajectories."""

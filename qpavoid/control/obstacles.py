@@ -16,6 +16,7 @@ import numpy as np
 
 from qpavoid import kernels
 from qpavoid.config import Sensing
+from qpavoid.control.distances import DistanceQuery
 from qpavoid.control.estimates import MeasuredStates
 from qpavoid.control.inputs import FAULTS
 from qpavoid.control.obstacle_states import NOTHING, Observation, ObstacleStates, StepUpdate
@@ -233,6 +234,16 @@ class ObstacleTracker:
             return None
         sampled = self._sample_custom(t, given.which.tolist()) if self._trajectories.others else ()
         return StepUpdate(t, shift, given, sampled)
+
+    @property
+    def follows_trajectories(self) -> bool:
+        """Whether obstacles move, and all of them by trajectories that kernels sample."""
+        return bool(self._moving) and not (self._measured.known or self._awaited or self._trajectories.others)
+
+    def follow(self, t: float, query: DistanceQuery) -> None:
+        """Bring obstacles that follow their trajectories to a step at t [s], and place them, in one compiled call."""
+        self._now, self._prediction = t, None
+        query.is_moving = self._measured.follow_trajectories(t, self.current.which, query.packed)
 
     def _sample_custom(self, t: float, given: Sequence[int]) -> list[tuple[int, Sample]]:
         """Sample the trajectories of other classes at t [s], but for obstacles that are given.

@@ -285,8 +285,9 @@ class StandingDynamics(RobotDynamics):
         if not self._is_settled:
             kernels.standing_torques(self.packed, self._packed_z, self._stance, v_measured, self._dt)
         forces, by_frame, at = z.solved[n : n + m].reshape(-1, 3) / self._dt, dict[str, Array](), 0
-        for contact, share, corners in zip(self._contacts.settings, self._contacts.shares, self._corners, strict=True):
-            if share > 0.0:
+        declared = zip(self._contacts.settings, self._contacts.shares, self._corners, strict=True)
+        for contact, fraction, corners in declared:
+            if fraction > 0.0:
                 by_frame[contact.frame] = forces[at : at + corners]
                 at += corners
         return solution._replace(

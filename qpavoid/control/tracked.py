@@ -26,7 +26,7 @@ class TrackedVelocities:
     frame_errors: Array
     row_scale: Array
     _layout: RowLayout
-    _packed: Any
+    packed: Any
     _stops: JerkStops | None
     _b_feasible: Array
 
@@ -35,7 +35,7 @@ class TrackedVelocities:
         x, feedback = self._layout, self._layout.feedback.copy()
         x.feedback[~A[: len(feedback)].any(axis=1)] = 0.0
         v = np.empty(A.shape[1])
-        kernels.tracking_law(self._packed, A, b, v, self._b_feasible)
+        kernels.tracking_law(self.packed, A, b, v, self._b_feasible)
         x.feedback[:] = feedback
         return v
 
@@ -52,7 +52,7 @@ class TrackedVelocities:
         """Return Σ w_r ∂²x_r/∂q² (nv, nv) of the rows of all frames; see `kernels.add_curvature`."""
         G = np.zeros_like(self._layout.identity)
         for part in range(len(w) // 3):
-            kernels.add_curvature(self._packed, part, w[3 * part : 3 * part + 3], G)
+            kernels.add_curvature(self.packed, part, w[3 * part : 3 * part + 3], G)
         return G
 
     def within_jerks(self, problem: Problem) -> Problem:
@@ -91,9 +91,9 @@ class TrackedVelocities:
         memory = x.v_tracking, x.rhs[:k], x.rhs_contact[:k]
         saved = [array.copy() for array in memory]
         x.v_tracking[:] = v
-        kernels.row_bounds(self._packed, k, self.query.is_moving)
+        kernels.row_bounds(self.packed, k, self.query.is_moving)
         if self.dynamics is not None:
-            kernels.slow_rows(self._packed, self.dynamics.packed, k)
+            kernels.slow_rows(self.packed, self.dynamics.packed, k)
         rows = rows._replace(b=x.rhs[:k].copy(), b_contact=x.rhs_contact[:k].copy())
         for array, values in zip(memory, saved, strict=True):
             array[:] = values

@@ -29,7 +29,7 @@ from qpavoid.kernels.dynamics import (
     project_widened,
 )
 from qpavoid.kernels.dynamics_rows import slow_rows
-from qpavoid.kernels.estimates import ObstacleArrays, check_updates, observe
+from qpavoid.kernels.estimates import ObstacleArrays, check_updates, follow_trajectories, observe
 from qpavoid.kernels.kinematics import KinematicsArrays, update_kinematics
 from qpavoid.kernels.layout import SUMMARY, RowLayout
 from qpavoid.kernels.margins import distances_of, least_margin
@@ -43,7 +43,14 @@ from qpavoid.kernels.pose_fit import extrapolate_states
 from qpavoid.kernels.prediction import Prediction, predict, prediction_error_bound
 from qpavoid.kernels.qp import max_clearance_velocity, minimize, project, project_soft
 from qpavoid.kernels.ramps import RampLimits, follow_ramp, velocity_towards
-from qpavoid.kernels.rollout import RolloutArrays, advance_rollout, begin_rollout, offset_of_start, rollout_outcome
+from qpavoid.kernels.rollout import (
+    RolloutArrays,
+    advance_rollout,
+    begin_rollout,
+    offset_after_step,
+    offset_of_start,
+    rollout_outcome,
+)
 from qpavoid.kernels.rotation import rotation_vector
 from qpavoid.kernels.rows import alpha, beta, distance_rows, row_bounds
 from qpavoid.kernels.standing import standing_step, standing_torques, with_impulses
@@ -113,6 +120,7 @@ __all__ = [
     "find_near_pairs",
     "first_use",
     "follow_ramp",
+    "follow_trajectories",
     "forward_dynamics",
     "frame_rows",
     "inverse_dynamics",
@@ -127,6 +135,7 @@ __all__ = [
     "minimize",
     "near_pairs",
     "observe",
+    "offset_after_step",
     "offset_of_start",
     "pack",
     "pair_clearances",

@@ -47,6 +47,11 @@ class ApproachArrays(NamedTuple):
     """(o, 2) largest of the speeds until the horizon."""
     scratch: Array
     """(o, 18)."""
+    proof: Array
+    """(3,) of the last proof that none comes near: the way that is left over [m], negative without a proof; the
+    distance that was kept [m]; the largest speed of an obstacle [m/s]."""
+    proof_centers: Array
+    """(g, 3) where the centres of the bodies were then [m]."""
     lever_arm: float
     """Bound on the distance that a point of the robot moves when a joint moves by 1 [m/rad, 1]."""
     dt: float
@@ -113,11 +118,13 @@ def comes_near(x: Any, distances: Any, v: Array, external: IntArray, on_paths: I
     Returns:
         Whether one may; largest speed of any point of an obstacle that moves [m/s].
     """
-    center, radius = _surround(x, distances)
     travel, fastest, near = 0.0, 0.0, False
     for j in range(len(v)):
         travel += x.dt * abs(v[j]) + x.braking[j] * v[j] * v[j]
     distance = PREFERRED_DISTANCE + (x.lever_arm * travel if travel > 0.0 else 0.0)  # a lever arm may be infinite
+    if len(external) == 0 and _still_holds(x, distances, distance):
+        return False, x.proof[2]
+    center, radius = _surround(x, distances)
     for i in external:
         u, w = x.twists[i, :3], x.twists[i, 3:]
         speed, turning = np.sqrt(u[0] ** 2 + u[1] ** 2 + u[2] ** 2), np.sqrt(w[0] ** 2 + w[1] ** 2 + w[2] ** 2)
@@ -127,24 +134,50 @@ def comes_near(x: Any, distances: Any, v: Array, external: IntArray, on_paths: I
             if near:
                 continue
             if x.turns[i, 0] == 0.0 and x.turns[i, 1] == 0.0 and x.turns[i, 2] == 0.0:
-                near = not _line_distance(p, u, speed, center) > keep + radius and _passes(
-                    x, distances, p, u, speed, keep
-                )
+                if not _line_distance(p, u, speed, center) > keep + radius:
+                    near = not _least_gap(x, distances, p, u, speed, keep) > 0.0
             elif not _distance(p, center) > keep + radius + speed * HORIZON:
                 near = _comes_round(x, distances, i, keep + 0.5 * PATH_PERIOD * speed, center, radius)
+    left = np.inf
     for i in on_paths:
         if x.spans[i, 3] < 0.0:
             continue
         speed, turning = x.peaks[i, 0], x.peaks[i, 1]
         fastest = max(fastest, speed + (turning * x.radii[i] if turning > 0.0 else 0.0))
-        keep = x.radii[i] + x.margin[i] + distance + 0.5 * PATH_PERIOD * speed
-        if near or _distance(x.spans[i], center) > keep + radius + x.spans[i, 3]:
+        if near:
             continue
-        for s in range(PATH_POINTS):
-            p = x.positions[s, i]
-            if not (near or _distance(p, center) > keep + radius):
-                near = _passes(x, distances, p, p, 0.0, keep)
+        keep = x.radii[i] + x.margin[i] + distance + 0.5 * PATH_PERIOD * speed
+        gap = _distance(x.spans[i], center) - (keep + radius + x.spans[i, 3])
+        if not gap > 0.0:
+            gap = np.inf
+            for s in range(PATH_POINTS):
+                p = x.positions[s, i]
+                away = _distance(p, center) - (keep + radius)
+                gap = np.minimum(gap, away if away > 0.0 else _least_gap(x, distances, p, p, 0.0, keep))
+        near, left = not gap > 0.0, min(left, gap)
+    x.proof[0], x.proof[1], x.proof[2] = -1.0 if near else left, distance, fastest
+    for b in range(len(distances.joints)):
+        for c in range(3):
+            x.proof_centers[b, c] = distances.centers[b, c]
     return near, fastest
+
+
+@compiled
+def _still_holds(x: Any, distances: Any, distance: float) -> bool:
+    """Return whether the last proof holds at another distance, as the bodies have not gone far since.
+
+    Where no centre has moved by more than δ, the sphere around all is no more than 3 δ nearer to anything.
+    """
+    square = 0.0
+    if not x.proof[0] > 0.0:
+        return False
+    for b in range(len(distances.joints)):
+        if distances.joints[b] >= 0:
+            moved = 0.0
+            for c in range(3):
+                moved += (distances.centers[b, c] - x.proof_centers[b, c]) ** 2
+            square = np.maximum(square, moved)  # keeps NaN, unlike max
+    return bool(3.0 * np.sqrt(square) + distance - x.proof[1] < x.proof[0])
 
 
 @compiled
@@ -164,7 +197,7 @@ def _comes_round(x: Any, distances: Any, i: int, keep: float, center: Array, rad
         state[:12], state[12:] = x.states[i, :12], x.twists[i]
         follow_arc(state, x.turns[i], s * PATH_PERIOD)
         p = state[9:12]
-        if not _distance(p, center) > keep + radius and _passes(x, distances, p, p, 0.0, keep):
+        if not _distance(p, center) > keep + radius and not _least_gap(x, distances, p, p, 0.0, keep) > 0.0:
             return True
     return False
 
@@ -193,16 +226,17 @@ def _surround(x: Any, distances: Any) -> tuple[Array, float]:
 
 
 @compiled
-def _passes(x: Any, distances: Any, p: Array, u: Array, speed: float, keep: float) -> bool:
-    """Return whether a point at p (3,) that goes on at u (3,) until the horizon comes within `keep` of a body.
+def _least_gap(x: Any, distances: Any, p: Array, u: Array, speed: float, keep: float) -> float:
+    """Compute how far beyond `keep` from all bodies a point at p (3,) stays that goes on at u (3,) until the horizon.
 
-    NaN counts as near.
+    Negative where it comes nearer; NaN where any number is.
     """
+    gap = np.inf
     for b in range(len(distances.joints)):
-        far = _line_distance(p, u, speed, distances.centers[b]) > keep + x.spheres[b, 3]
-        if distances.joints[b] >= 0 and not far:
-            return True
-    return False
+        if distances.joints[b] >= 0:
+            away = _line_distance(p, u, speed, distances.centers[b]) - (keep + x.spheres[b, 3])
+            gap = np.minimum(gap, away)  # keeps NaN, unlike min
+    return gap
 
 
 @compiled

@@ -100,7 +100,7 @@ def dynamics_step(
         See `control_step`.
     """
     if not is_measured:
-        _, _, meeting = find_near_pairs(x, q)
+        _, _, meeting = find_near_pairs(x, q, influence_distance)
         if meeting > 0:
             return TO_MEASURE
     s, n, m = x.summary[0], len(x.v_prev), len(y.rhs) - len(x.rhs)

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from qpavoid.kernels.near_pairs import place_obstacles
 from qpavoid.kernels.obstacles import (
     EXACT,
     FINE,
@@ -163,6 +164,25 @@ def observe(x: Any, t: float, which: IntArray, kind: IntArray, times: Array, ext
                 margin[i] += MARGIN_GROWTH * (age - x.stale_after)
             extrapolate(states[i], min(age, _LONGEST))
     return rejected, stale
+
+
+@compiled
+def follow_trajectories(x: Any, distances: Any, t: float, numbers: IntArray) -> bool:
+    """Bring all obstacles to a time, and place them, where none of them is given by a program.
+
+    Args:
+        x: see `ObstacleArrays`.
+        distances: see `place_obstacles`.
+        t: time [s].
+        numbers: of the obstacles to place (k,).
+
+    Returns:
+        Whether any moves, or has a margin.
+    """
+    sample_pieces(x.pieces, t, x.states)
+    for i in range(len(x.margin)):
+        x.margin[i] = x.uncertainty[i]
+    return place_obstacles(distances, numbers, x.states, x.margin)[1]
 
 
 @compiled

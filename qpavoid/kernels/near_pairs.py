@@ -10,9 +10,9 @@ from typing import NamedTuple
 import numpy as np
 
 from qpavoid.kernels.broadphase import candidates
-from qpavoid.kernels.distances import compute_distances
+from qpavoid.kernels.distances import SPARE_BY_COAL, compute_distances
 from qpavoid.kernels.kinematics import compose
-from qpavoid.kernels.packing import compiled
+from qpavoid.kernels.packing import compiled, inlined
 from qpavoid.kernels.support import Shapes
 from qpavoid.problem import Array, IntArray, Mask
 
@@ -67,6 +67,13 @@ class DistanceArrays(NamedTuple):
     """(g, 12) pose of each body in the world."""
     centers: Array
     """(g, 5) centres of the bounding spheres in the world, as rows [c, 1, -|c|²] [m]."""
+    radius: Array
+    """(g,) of the bounding spheres [m]."""
+    travels: Array
+    """(g,) bound on the path that any point of each body has travelled so far [m]."""
+    limits: Array
+    """(m,) distance of each pair when it was computed plus the travels of its bodies until then: less those until now,
+    it bounds the distance from below; -∞ of pairs that coal computes, and of those that are not known [m]."""
     guesses: Array
     """(m, GUESS) where the search for the witness points of each pair starts, see `kernels.gjk`."""
     near: IntArray
@@ -83,39 +90,73 @@ class DistanceArrays(NamedTuple):
 
 @compiled
 def place_bodies(x: DistanceArrays, joint_poses: Array) -> None:
-    """Write the poses of all bodies that joints move.
+    """Write the poses of all bodies that joints move, their sphere centres and travels.
 
     Args:
-        x: reads joints and placements; writes poses.
+        x: reads joints and placements; writes poses, centers and travels.
         joint_poses: (J, 12).
     """
+    pose = np.empty(12)
     for i in range(len(x.joints)):
         if x.joints[i] >= 0:
-            compose(joint_poses[x.joints[i]], x.placements[i], x.poses[i])
+            compose(joint_poses[x.joints[i]], x.placements[i], pose)
+            place_body(x, i, pose)
 
 
 @compiled
-def near_pairs(x: DistanceArrays) -> tuple[int, int, int]:
+def near_pairs(x: DistanceArrays, beyond: float) -> tuple[int, int, int]:
     """Find the near pairs, and write the distances of those that coal is not needed for.
 
+    No distance changes by more than its two bodies travel: pairs that are certainly beyond a distance, since they were
+    computed last, are left out.
+
     Args:
-        x: reads poses; writes centers of movable bodies, near, rows, meeting, counts and results.
+        x: reads poses, margin and travels; writes centers of movable bodies, near, rows, meeting, counts, results and
+            limits.
+        beyond: that distance, less the margin [m]; infinite to leave none out.
 
     Returns:
         `counts`.
     """
+    near, count, rows = candidate_pairs(x), 0, 0
+    for n in range(near):
+        k = x.near[n]
+        if not least_distance(x, k) - x.margin[x.twist_row[k]] >= beyond:  # NaN, too
+            x.near[count] = k
+            count += 1
+            if not x.ignored[k]:
+                x.rows[rows] = k
+                rows += 1
+    meeting = measure_pairs(x, x.near[:count])
+    x.counts[0], x.counts[1], x.counts[2] = count, rows, meeting
+    return count, rows, meeting
+
+
+@compiled
+def candidate_pairs(x: DistanceArrays) -> int:
+    """Write the pairs whose bounding spheres are near into `near`; return how many there are."""
     bodies = len(x.joints)
     while bodies > 0 and x.joints[bodies - 1] < 0:  # from there on, both bodies of each pair are obstacles
         bodies -= 1
-    near = candidates(x.poses, x.local, x.centers, x.max_square[:bodies], x.pair_of[:bodies], x.enabled, x.near)
-    meeting = compute_distances(x.shapes, x.poses, x.pairs, x.method, x.near[:near], x.guesses, x.results, x.meeting)
-    rows = 0
-    for k in x.near[:near]:
-        if not x.ignored[k]:
-            x.rows[rows] = k
-            rows += 1
-    x.counts[0], x.counts[1], x.counts[2] = near, rows, meeting
-    return near, rows, meeting
+    return candidates(x.poses, x.local, x.centers, x.max_square[:bodies], x.pair_of[:bodies], x.enabled, x.near)
+
+
+@inlined
+def least_distance(x: DistanceArrays, k: int) -> float:
+    """Bound the distance of pair k from below by where its bodies have been since it was computed [m]."""
+    return x.limits[k] - x.travels[x.pairs[k, 0]] - x.travels[x.pairs[k, 1]]
+
+
+@compiled
+def measure_pairs(x: DistanceArrays, pairs: IntArray) -> int:
+    """Write results and limits of some pairs (k,), and those of them that coal has to compute; return how many."""
+    meeting = compute_distances(x.shapes, x.poses, x.pairs, x.method, pairs, x.guesses, x.results, x.meeting)
+    for k in pairs:
+        if x.method[k] > SPARE_BY_COAL:
+            x.limits[k] = x.results[k, 0] + x.travels[x.pairs[k, 0]] + x.travels[x.pairs[k, 1]]
+    for k in x.meeting[:meeting]:
+        x.limits[k] = -np.inf
+    return meeting
 
 
 @compiled
@@ -144,8 +185,9 @@ def place_obstacles(x: DistanceArrays, numbers: IntArray, states: Array, margin:
         if not abs(total) < np.inf:  # isfinite does not survive the reordering of sums
             return i, True
     for i in numbers:
-        x.states[i] = states[i]
-        state, twist = x.states[i], x.twists[i]
+        state, twist = states[i], x.twists[i]
+        for c in range(18):
+            x.states[i, c] = state[c]
         px, py, pz = state[9], state[10], state[11]
         vx, vy, vz, wx, wy, wz = state[12], state[13], state[14], state[15], state[16], state[17]
         twist[0], twist[1], twist[2] = vx - wy * pz + wz * py, vy - wz * px + wx * pz, vz - wx * py + wy * px
@@ -165,13 +207,28 @@ def place_obstacles(x: DistanceArrays, numbers: IntArray, states: Array, margin:
 
 
 @compiled
-def place_body(x: DistanceArrays, g: int, state: Array) -> None:
-    """Write pose and sphere centre of a body whose frame is that of an obstacle's state."""
-    length = 0.0
+def place_body(x: DistanceArrays, g: int, pose: Array) -> None:
+    """Write pose and sphere centre of a body, and add to its travel what no point of it exceeds.
+
+    With ‖δR‖ r for points at r from the centre; of a rotation, the Frobenius norm is √2 times that.
+
+    Args:
+        x: writes poses, centers and travels.
+        g: number of the body.
+        pose: new pose, the first entries (>= 12,).
+    """
+    shift, turned, length = 0.0, 0.0, 0.0
+    for c in range(9):
+        turned += (pose[c] - x.poses[g, c]) ** 2
     for c in range(12):
-        x.poses[g, c] = state[c]
+        x.poses[g, c] = pose[c]
     for r in range(3):
-        rotated = state[r] * x.local[g, 0] + state[3 + r] * x.local[g, 1] + state[6 + r] * x.local[g, 2]
-        x.centers[g, r] = rotated + state[9 + r]
-        length += x.centers[g, r] ** 2
+        center = pose[r] * x.local[g, 0] + pose[3 + r] * x.local[g, 1] + pose[6 + r] * x.local[g, 2] + pose[9 + r]
+        shift += (center - x.centers[g, r]) ** 2
+        length += center * center
+        x.centers[g, r] = center
     x.centers[g, 4] = -length
+    travel = np.sqrt(shift)
+    if turned > 0.0:  # radii may be infinite
+        travel += np.sqrt(0.5 * turned) * x.radius[g]
+    x.travels[g] += travel

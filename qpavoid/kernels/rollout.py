@@ -109,12 +109,13 @@ class RolloutArrays(NamedTuple):
 
 @compiled
 def begin_rollout(
-    r: Any, t: float, horizon: float, prefix_steps: int, time: float, clearance: float, measures_outside: bool
+    r: Any, x: Any, t: float, horizon: float, prefix_steps: int, time: float, clearance: float, measures_outside: bool
 ) -> None:
     """Begin a rollout whose first row, `dv`, prefix, bias velocity and enabled pairs are written.
 
     Args:
         r: memory, see `RolloutArrays`.
+        x: memory of its distances, see `DistanceArrays`.
         t: time of the start [s].
         horizon: of the policy [s].
         prefix_steps: control steps before the policy decides.
@@ -129,7 +130,7 @@ def begin_rollout(
     s.stage, s.pose, s.steps, s.near, s.span = PLACE, _START, 0, 0, 0.0
     s.contact_time, s.lost_time, s.clearance, s.clearance_before = np.inf, 0.0, np.inf, np.inf
     r.q_pose[:], r.v_pose[:] = r.q[0], r.v[0]
-    forget_pairs(r.pairs)
+    forget_pairs(x, r.pairs)
 
 
 @compiled
@@ -161,6 +162,39 @@ def offset_of_start(r: Any, offset: Array, v: Array, dv: Array, targets: Array, 
     """
     ramp = follow_ramp(r.ramp_limits, v, dv, targets, False, True) if is_accelerated else targets[:0]
     return max_offset(offset, ramp, targets, r.progress[0].dt)
+
+
+@compiled
+def offset_after_step(
+    r: Any, x: Any, q: Array, path: Array, targets: Array, steps: int, enabled: Mask, separable: Mask,
+    is_accelerated: bool,
+) -> float:  # fmt: skip
+    """Compute `offset_of_start` from a trajectory without its first steps, after a control step at the velocity of x.
+
+    Args:
+        r: memory, see `RolloutArrays`; not changed.
+        x: memory of the control step, see `RowLayout`; not changed.
+        q: configuration of that (nq,), with nq = n.
+        path: configurations of the trajectory after each of its steps (k, n).
+        targets: velocities of its steps (k, n).
+        steps: how many of these are left out.
+        enabled: pairs that may not come into contact along it (m,).
+        separable: pairs whose distance depends on a joint (m,).
+        is_accelerated: see `offset_of_start`.
+
+    Returns:
+        The offset; infinite where a pair is in contact, or others are enabled by now.
+    """
+    for i in range(x.summary[0].rows):
+        if not x.closest[i, 0] >= TOUCH:
+            return np.inf
+    same = True
+    for k in range(len(enabled)):
+        same = same and enabled[k] == (separable[k] and not x.distances.ignored[k])
+    if not same:
+        return np.inf
+    offset = q + r.progress[0].dt * x.v - path[steps - 1]
+    return offset_of_start(r, offset, x.v, x.v - x.v_prev, targets[steps:], is_accelerated)
 
 
 @compiled
@@ -201,9 +235,7 @@ def advance_rollout(r: Any, x: Any, prediction: Prediction) -> tuple[int, int, i
                 return NOT_FINITE, bad, 0, 0
             update_kinematics(x.kinematics, r.q_pose)
             place_bodies(x.distances, x.joint_poses)
-            near, s.rows, meeting = near_pairs_along(
-                x.distances, r.pairs, prediction.which, s.pose == _START, s.influence_distance, PREFERRED_DISTANCE
-            )
+            near, s.rows, meeting = near_pairs_along(x.distances, r.pairs, s.influence_distance, PREFERRED_DISTANCE)
             if meeting > 0 or s.completes_outside:
                 return TO_MEASURE, near, s.rows, meeting
         if _evaluate(r, x):

@@ -26,19 +26,20 @@ SETTLED, UNSETTLED, TO_MEASURE, TO_SOLVE = range(4)
 
 
 @compiled
-def find_near_pairs(x: Any, q: Array) -> tuple[int, int, int]:
-    """Compute kinematics and the distances of the near pairs that have a closed form.
+def find_near_pairs(x: Any, q: Array, influence_distance: float) -> tuple[int, int, int]:
+    """Compute kinematics and the distances of the near pairs that coal is not needed for.
 
     Args:
         x: memory of the step; see `RowLayout`.
         q: configuration (nq,).
+        influence_distance: surface distance below which a pair is near [m].
 
     Returns:
         What `near_pairs` returns.
     """
     update_kinematics(x.kinematics, q)
     place_bodies(x.distances, x.joint_poses)
-    return near_pairs(x.distances)
+    return near_pairs(x.distances, influence_distance)
 
 
 @compiled
@@ -58,7 +59,7 @@ def control_step(x: Any, q: Array, influence_distance: float, moving: bool, from
         distances of some near pairs have to be computed by other means first.
     """
     if not is_measured:
-        _, _, meeting = find_near_pairs(x, q)
+        _, _, meeting = find_near_pairs(x, q, influence_distance)
         if meeting > 0:
             return TO_MEASURE
     pairs, s = x.distances.rows[: x.distances.counts[1]], x.summary[0]

@@ -42,7 +42,7 @@ class Arbiter:
         self._braking = BrakingCheck(settings, rows, obstacles)
         self.progress, self._shake_damping = ProgressMonitor(settings, rows), ShakeDamping(settings.dt)
         has_backup = settings.avoidance.backup and len(settings.scene.slots) > 0
-        self.backup = BackupPlanner(settings, rows.query, obstacles) if has_backup else None
+        self.backup = BackupPlanner(settings, rows, obstacles) if has_backup else None
 
     def reset(self) -> None:
         """Drop all that is known of earlier control steps."""
@@ -64,9 +64,12 @@ class Arbiter:
     def accepts(self, t: float) -> bool:
         """Count a settled step of the tasks at t [s] if it is commanded as it is, else change nothing; see `decide`."""
         damping, backup = self._shake_damping, self.backup
-        if self._reports_limits or damping.factor != 1.0 or not damping.is_idle:
+        if self._reports_limits or damping.factor != 1.0 or not damping.is_idle or not self.progress.is_quiet:
             return False
-        return (backup is None or backup.rests(self._rows.v, t)) and self.progress.skip()
+        if backup is not None and not backup.allows(self._rows.v, t):
+            return False
+        self.progress.skip()
+        return True
 
     def decide(self, q: Array, t: float, is_settled: bool, from_tasks: bool) -> Solution:
         """Return the solution that is commanded.

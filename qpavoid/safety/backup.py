@@ -19,19 +19,19 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from math import ceil, inf
-from typing import NamedTuple
 
 import numpy as np
 import pinocchio as pin
 
-from qpavoid.control.distances import DistanceQuery
+from qpavoid.control.assembler import RowAssembler
 from qpavoid.control.obstacles import ObstacleTracker
 from qpavoid.control.settings import ControlSettings
 from qpavoid.errors import NumericalError
 from qpavoid.kernels.rollout import FINISHED, HORIZON, PAUSED, TOUCH
 from qpavoid.problem import Array, Mask, Proximity
-from qpavoid.safety.approach import ApproachCheck
-from qpavoid.safety.rollout import LEAST_SCORE, BackupPolicy, BackupRollouts, BackupScore, BackupTrajectory, Start
+from qpavoid.safety.approach import ApproachCheck, SettledSteps
+from qpavoid.safety.candidates import BackupPolicies, Command
+from qpavoid.safety.rollout import LEAST_SCORE, BackupRollouts, BackupScore, BackupTrajectory, Start
 
 _PERIOD_FRACTION = 0.128
 """Fraction of a control period in which candidates are computed [-]."""
@@ -41,12 +41,6 @@ _BEGIN_POSES = 8
 """Poses that take as long as it takes to begin a candidate [-]: at its first pose, all distances are new."""
 _FEWEST_POSES = 10
 """Poses that are evaluated in a control step at least [-]: a candidate has about 45, and an obstacle does not wait."""
-_HORIZONS = (0.2, 0.05, 0.5)
-"""h of backup policies [s]: the most successful first."""
-_UNBIASED_FRACTION = 0.25
-"""Fraction of the sampled policies without a bias velocity [-]."""
-_BIAS_SPEEDS = (2.0, 30.0)
-"""Range of ‖v̂‖ of the others, log-uniform [rad/s, m/s]: from a tie-break to full speed."""
 _CANDIDATES_AHEAD = 3
 """Candidates that can be computed before the kept trajectory is no longer valid [-]: as many may fail. It holds the
 velocity of the solver as long, and the next one is begun so early."""
@@ -67,31 +61,16 @@ _CYCLE = 8, 4
 """Candidates of each kind after which those that are not sampled are tried again."""
 
 
-class _Command(NamedTuple):
-    """What is commanded in a control step, as far as it is decided."""
-
-    v: Array
-    """(nv,)."""
-    after: Start
-    """State that it leads to."""
-    after_task: Start
-    """State that the velocity of the solver leads to."""
-    is_task: bool
-    """Whether it is the velocity of the solver."""
-
-    def to_task(self) -> _Command:
-        """Return the velocity of the solver as the command."""
-        return _Command(self.after_task.v, self.after_task, self.after_task, True)
-
-
 class BackupPlanner:
     """Decides between the velocity of the solver and the first one of a backup trajectory."""
 
-    def __init__(self, settings: ControlSettings, query: DistanceQuery, obstacles: ObstacleTracker) -> None:
-        """Begin without a backup trajectory; `query` has the distances of the control step."""
+    def __init__(self, settings: ControlSettings, rows: RowAssembler, obstacles: ObstacleTracker) -> None:
+        """Begin without a backup trajectory; `rows` are those of the control step."""
         self._model, self._obstacles, self._dt = settings.scene.robot.model, obstacles, settings.dt
-        self._rollouts = BackupRollouts(settings, query.table, obstacles)
-        self._approach = ApproachCheck(settings, query, self._rollouts.lever_arm, obstacles)
+        self._rollouts = BackupRollouts(settings, rows.query.table, obstacles)
+        self._settled = SettledSteps(self._rollouts, rows)
+        self._approach = ApproachCheck(settings, rows.query, self._rollouts.lever_arm, obstacles)
+        self._policies = BackupPolicies(settings.scene.robot.model.nv)
         self._poses = max(_FEWEST_POSES, round((_PERIOD_FRACTION * settings.dt - _SEARCH_TIME) / _POSE_TIME))
         """Poses of candidates that are evaluated in a control step: 114 at 100 Hz, 17 at 500 Hz."""
         self._candidate_poses = self._rollouts.usual_poses + _BEGIN_POSES
@@ -106,7 +85,7 @@ class BackupPlanner:
 
     def reset(self) -> None:
         """Drop the backup trajectory, and restart the random sequence."""
-        self._random = np.random.default_rng(0)
+        self._policies.restart()
         self._approach.reset()
         self._forget()
 
@@ -121,14 +100,17 @@ class BackupPlanner:
         """Kept, from the present state on."""
         self._kind, self._age = -1, 0
         """Of the candidate, -1 without one; control steps since it began."""
-        self._lasting_steps = 0
-        """Control steps for which the kept trajectory is known to last long enough."""
-        self._tried, self._sampled, self._untried = [0, 0], 0, _FIRST_CANDIDATES
+        self._lasting_steps = self._behind = 0
+        """Control steps for which the kept trajectory is known to last long enough; that were settled since it was cut
+        last."""
+        self._tried, self._untried = [0, 0], _FIRST_CANDIDATES
+        self._policies.begin()
         self._moving = self._obstacles.moving
 
     @property
     def velocities(self) -> Array:
         """Return the velocities (k, nv) of the control steps of the backup trajectory; none without one."""
+        self._catch_up()
         return np.zeros((0, self._model.nv)) if self._backup is None else self._backup.v
 
     @property
@@ -136,11 +118,29 @@ class BackupPlanner:
         """Whether there is a backup trajectory or a candidate: while nothing moves, `check` would only drop it."""
         return self._backup is not None or self._kind >= 0
 
-    def rests(self, v: Array, t: float) -> bool:
-        """Return whether nothing that moves is near a robot at v (nv,) at t [s], nor was: `check` changes nothing."""
-        if self.is_active or self._moving is not self._obstacles.moving:
+    def allows(self, v: Array, t: float) -> bool:
+        """Return whether v (nv,), that of a settled step at t [s], may be commanded with nothing to search for.
+
+        So it is where nothing that moves is near, nor was, and `check` would change nothing; and where the kept
+        trajectory stays valid: that counts as a control step.
+        """
+        if self._moving is not self._obstacles.moving:
             return False
-        return not len(self._moving) or self._approach.is_far(v, t)
+        if not self.is_active:
+            return not len(self._moving) or self._approach.is_far(v, t)
+        backup, steps = self._backup, self._behind + 1
+        if backup is None or self._kind >= 0 or self._lasting_steps == 0 or len(self._obstacles.external):
+            return False
+        if not self._settled.leaves_valid(backup, steps, t):
+            return False
+        self._behind, self._lasting_steps = steps, self._lasting_steps - 1
+        return True
+
+    def _catch_up(self) -> None:
+        """Cut the kept trajectory by the control steps that were settled."""
+        if self._backup is not None:
+            self._backup = self._rollouts.advance(self._backup, self._behind)
+        self._behind = 0
 
     def check(
         self, q: Array, v: Array, t: float, v_prev: Array, dv_prev: Array, proximity: Callable[[], Proximity]
@@ -156,19 +156,21 @@ class BackupPlanner:
             proximity: returns the distances of this control step; pairs in contact do not count.
         """
         self.is_cut = False
+        self._catch_up()
         is_same_scene = self._moving is self._obstacles.moving
-        is_near = len(self._obstacles.moving) > 0 and not self._approach.is_far(v, t)
+        lasts = self._lasting_steps > 0 and not len(self._obstacles.external)  # as `allows` takes it
+        is_near = len(self._obstacles.moving) > 0 and (lasts or not self._approach.is_far(v, t))
         if not (is_near and is_same_scene):
             self._forget()
         if not is_near:
             return None
         state = Start(q, v_prev.copy(), dv_prev.copy(), t, self._enabled(proximity()))
         backup, after_task = self._backup, self._after(state, v)
-        command = _Command(v, after_task, after_task, True)
+        command = Command(v, after_task, after_task, True)
         if backup is not None and len(backup.v):
             self._backup = self._rollouts.advance(backup)
             if not (self._is_valid(self._backup, after_task) or self._may_wait(self._backup)):
-                command = _Command(backup.v[0], self._after(state, backup.v[0]), after_task, False)
+                command = Command(backup.v[0], self._after(state, backup.v[0]), after_task, False)
         else:
             self._backup = None
         command = self._search(command, command.is_task or self._is_valid(backup, state))
@@ -185,8 +187,12 @@ class BackupPlanner:
 
     def _after(self, state: Start, v: Array) -> Start:
         """Return the state after a control step at v (nv,)."""
-        q = pin.integrate(self._model, state.q, self._dt * v)
+        q = self._moved(state.q, self._dt * v)
         return Start(q, v, v - state.v, state.t + self._dt, state.enabled)
+
+    def _moved(self, q: Array, displacement: Array) -> Array:
+        """Return the configuration (nq,) after a displacement (nv,)."""
+        return q + displacement if self._rollouts.adds_up else pin.integrate(self._model, q, displacement)
 
     def _is_valid(self, trajectory: BackupTrajectory | None, start: Start) -> bool:
         """Return whether a trajectory is certainly sufficient from a start close to its own."""
@@ -196,7 +202,7 @@ class BackupPlanner:
         """Return whether the search has just begun, and the best trajectory so far leads to no contact soon."""
         return self._untried > 0 and backup.score.time_to_contact > _URGENT
 
-    def _search(self, command: _Command, is_valid: bool) -> _Command:
+    def _search(self, command: Command, is_valid: bool) -> Command:
         """Evaluate the poses of this control step; return what is commanded with what they show.
 
         Args:
@@ -233,12 +239,13 @@ class BackupPlanner:
             elif self._is_acceptable(candidate, command.after_task):
                 self._backup, self._lasting_steps, command = candidate, 0, command.to_task()
                 if candidate.score >= rollouts.sufficient_score:
-                    self._tried, self._sampled, self._untried, is_valid = [0, 0], 0, 0, True
+                    self._tried, self._untried, is_valid = [0, 0], 0, True
+                    self._policies.begin()
                     if self._age == 0:
                         break
         return command
 
-    def _lasts(self, command: _Command) -> bool:
+    def _lasts(self, command: Command) -> bool:
         """Return whether the kept trajectory will be valid until others are known, if the same is commanded."""
         if self._backup is None or not command.is_task:
             return False
@@ -250,12 +257,12 @@ class BackupPlanner:
             return True
         return self._is_valid_after(self._steps_ahead, command)
 
-    def _is_valid_after(self, steps: int, command: _Command) -> bool:
+    def _is_valid_after(self, steps: int, command: Command) -> bool:
         """Return whether the kept trajectory will be valid some steps later, if the same is commanded."""
         start, backup = command.after, self._backup
         if backup is None or len(backup.v) <= steps:
             return False
-        q = pin.integrate(self._model, start.q, steps * self._dt * start.v)
+        q = self._moved(start.q, steps * self._dt * start.v)
         later = Start(q, start.v, np.zeros_like(start.v), start.t + steps * self._dt, start.enabled)
         return self._is_valid(self._rollouts.advance(backup, steps), later)
 
@@ -264,9 +271,13 @@ class BackupPlanner:
         backup, sufficient = self._backup, self._rollouts.sufficient_score
         if backup is None or self._is_valid(candidate, after_task):
             return True
-        return backup.score < sufficient and self._not_worse(candidate.score, backup.score)
+        if backup.score >= sufficient:
+            return False
+        clearance = self._rollouts.clearance_from(candidate, after_task)  # the solver may lead elsewhere by now
+        score = candidate.score._replace(clearance=min(clearance, candidate.score.clearance))
+        return clearance >= TOUCH and self._not_worse(score, backup.score)
 
-    def _begin(self, command: _Command, is_valid: bool, poses: int) -> None:
+    def _begin(self, command: Command, is_valid: bool, poses: int) -> None:
         """Begin the next candidate, of which some poses can be evaluated in this control step."""
         self._kind = _WITH_TASK if is_valid or self._backup is None or sum(self._tried) % 2 else _ALONE
         if self._backup is None:
@@ -278,7 +289,7 @@ class BackupPlanner:
         begin = self._begin_with_task if self._kind == _WITH_TASK else self._begin_alone
         begin(command, number, steps)
 
-    def _begin_with_task(self, command: _Command, number: int, steps: int) -> None:
+    def _begin_with_task(self, command: Command, number: int, steps: int) -> None:
         """Begin a candidate that goes on with the velocity of the solver, in so many control steps."""
         backup, v = self._backup, command.after_task.v
         start, prefix = command.after_task, np.tile(v, (steps + self._steps_ahead - 1, 1))
@@ -288,7 +299,7 @@ class BackupPlanner:
             policy = backup.policy
             prefix = np.concatenate((prefix, backup.v[len(prefix) :])) if number == 1 else prefix
         else:
-            policy = self._rollouts.stop_policy if number == 2 else self._sample_policy()
+            policy = self._rollouts.stop_policy if number == 2 else self._policies.sample()
         self._rollouts.begin(start, policy, prefix, self._least_score(steps + 1))
 
     def _least_score(self, steps: int) -> BackupScore:
@@ -300,17 +311,21 @@ class BackupPlanner:
             return sufficient._replace(clearance=sufficient.clearance - _DISTANCE_TOLERANCE)
         return BackupScore(backup.score.time_to_contact - steps * self._dt, -inf)
 
-    def _begin_alone(self, command: _Command, number: int, steps: int) -> None:
+    def _begin_alone(self, command: Command, number: int, steps: int) -> None:
         """Begin a candidate with the beginning of the kept trajectory, or with all of it: then it replaces that."""
         backup, rollouts = self._backup, self._rollouts
         assert backup is not None
         if number == 0:
             rollouts.begin(command.after, backup.policy, backup.v, LEAST_SCORE)
             return
-        k = rollouts.decision_before(command.after, int(self._random.integers(len(backup.v) + 1))) if number % 2 else 0
+        k = (
+            rollouts.decision_before(command.after, int(self._policies.random.integers(len(backup.v) + 1)))
+            if number % 2
+            else 0
+        )
         time, clearance = backup.score
         least = BackupScore(time - steps * self._dt if time < HORIZON else time, clearance)
-        rollouts.begin(command.after, self._sample_policy(), backup.v[: max(k, steps)], least)
+        rollouts.begin(command.after, self._policies.sample(), backup.v[: max(k, steps)], least)
 
     def _steps_needed(self, poses: int) -> int:
         """Return the control steps after this one that a trajectory takes with so many poses in this one."""
@@ -327,18 +342,6 @@ class BackupPlanner:
             later.time_to_contact + self._dt >= now.time_to_contact
             and later.clearance >= now.clearance - _DISTANCE_TOLERANCE
         )
-
-    def _sample_policy(self) -> BackupPolicy:
-        """Sample a policy: each unbiased horizon once, then random ones."""
-        random, unbiased, number = self._random, self._rollouts.stop_policy.bias_velocity, self._sampled
-        self._sampled += 1
-        if number < len(_HORIZONS):
-            return BackupPolicy(_HORIZONS[number], unbiased)
-        h = _HORIZONS[random.integers(len(_HORIZONS))]
-        if random.random() < _UNBIASED_FRACTION:
-            return BackupPolicy(h, unbiased)
-        direction, speed = random.normal(size=self._model.nv), np.exp(random.uniform(*np.log(_BIAS_SPEEDS)))
-        return BackupPolicy(h, speed / np.linalg.norm(direction) * direction)
 
 
 def _unless_equal(v: Array, other: Array) -> Array | None:

@@ -72,12 +72,14 @@ class ProgressMonitor:
         """Call what names reasons once: no control step waits for the kernels."""
         self._rows.curvature(np.zeros_like(self._rows.frame_errors))
 
-    def skip(self) -> bool:
-        """Count a step in which there is nothing to check nor to say; return False where there is, uncounted."""
-        if self._stalled or (self._step + 1) % self._interval == 0:
-            return False
+    @property
+    def is_quiet(self) -> bool:
+        """Whether there is nothing to check nor to say in the next step."""
+        return not self._stalled and (self._step + 1) % self._interval != 0
+
+    def skip(self) -> None:
+        """Count a step in which that is so."""
         self._step += 1
-        return True
 
     def update(self, problem: Problem | None, solution: Solution) -> tuple[Reason, ...]:
         """Return what keeps the tasks from their targets, after long enough without progress.

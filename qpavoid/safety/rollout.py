@@ -51,7 +51,7 @@ _INFLUENCE_DISTANCE = 0.25
 At 0.2, two obstacles in 236 random scenes touch the robot that are evaded at 0.25 and 0.3, which take longer."""
 _DISTANCE_SCALE = 0.5
 """Fraction of the safety distance that has to be kept [-]: predictions may be wrong by the other half."""
-_ROUND_OFF = 1e-6
+ROUND_OFF = 1e-6
 """Difference of two times that counts as none [s]."""
 _UNLIMITED = 1e9
 """Stands for no limit of a speed [rad/s, m/s]: finite, so that 0 times it is 0."""
@@ -122,10 +122,10 @@ class BackupRollouts:
 
     def __init__(self, settings: ControlSettings, table: PairTable, obstacles: ObstacleTracker) -> None:
         """Allocate all memory, and compile all kernels."""
-        scene, self._dt = settings.scene, settings.dt
+        scene, self.dt = settings.scene, settings.dt
         model = self._model = scene.robot.model
-        self._obstacles, period_steps = obstacles, max(1, int(np.ceil(_PERIOD / self._dt - 1e-9)))
-        self.period = period_steps * self._dt
+        self._obstacles, period_steps = obstacles, max(1, int(np.ceil(_PERIOD / self.dt - 1e-9)))
+        self.period = period_steps * self.dt
         """Time between two decisions [s]."""
         self.kinematics, self.query = ForwardKinematics(model), DistanceQuery(scene, table)
         self.query.set_influence_distance(_INFLUENCE_DISTANCE)
@@ -134,8 +134,8 @@ class BackupRollouts:
         relaxed = replace(settings, bounds=free, dt=self.period)
         layout = lay_out(relaxed, (), (), self.kinematics, self.query)
         self.packed, self._v_step = kernels.pack(layout), layout.v_step
-        self._ramp_limits = _ramp_limits(settings.bounds, self._dt)
-        self._is_accelerated = bool(np.isfinite(settings.bounds.acceleration).any())
+        self._ramp_limits = _ramp_limits(settings.bounds, self.dt)
+        self.is_accelerated = bool(np.isfinite(settings.bounds.acceleration).any())
         self.lever_arm = max(1.0, max_lever_arm(model, table.max_extension()))
         """Bound on the distance that a point of the robot moves when a joint moves by 1 [m/rad, 1]."""
         self.sufficient_score = BackupScore(HORIZON, _DISTANCE_SCALE * settings.safety_distance)
@@ -146,7 +146,7 @@ class BackupRollouts:
         self.stop_policy = BackupPolicy(0.0, zero)
         """Braking to a standstill."""
         self._memory = self._lay_out(period_steps)
-        self._packed_memory, self._progress = kernels.pack(self._memory), self._memory.progress[0]
+        self.packed_memory, self._progress = kernels.pack(self._memory), self._memory.progress[0]
         self._poses: Array = self._memory.progress.view(np.ndarray)["poses"]
         self._has_kernels = self.kinematics.is_compiled and not self.query.has_clouds
         # every kernel once, so that no control step waits for the compiler
@@ -155,18 +155,20 @@ class BackupRollouts:
         with suppress(NumericalError):  # of a trajectory that gives nonsense: the steps say so
             self.resume(2)
         self.result()
+        self.adds_up = model.nq == model.nv
+        """Whether configurations and displacements add up, number by number."""
         self._offset_of_start = kernels.direct(
-            kernels.offset_of_start, self._packed_memory, zero, zero, zero, zero[None], self._is_accelerated
+            kernels.offset_of_start, self.packed_memory, zero, zero, zero, zero[None], self.is_accelerated
         )
         kernels.prediction_error_bound(obstacles.prediction, obstacles.prediction, 0.0, self.query.obstacle_radii)
 
     def _lay_out(self, period_steps: int) -> RolloutArrays:
         """Lay out the memory of one rollout."""
-        model, count = self._model, int((HORIZON + BEYOND) / self._dt) + 2 + period_steps
+        model, count = self._model, int((HORIZON + BEYOND) / self.dt) + 2 + period_steps
         progress = np.zeros(1, PROGRESS).view(np.recarray)
         s = progress[0]
         s.influence_distance = _INFLUENCE_DISTANCE
-        s.dt, s.period_steps, s.sufficient = self._dt, period_steps, self.sufficient_score.clearance
+        s.dt, s.period_steps, s.sufficient = self.dt, period_steps, self.sufficient_score.clearance
         s.completes_outside = not self.query.is_compiled
         s.moves_outside = model.nq != model.nv
         return RolloutArrays(
@@ -188,7 +190,7 @@ class BackupRollouts:
 
     def brake_with(self, acceleration: Array) -> None:
         """Take accelerations (nv,) as those on which braking counts from now on [rad/s² or m/s²]."""
-        self._v_step[:], self._ramp_limits.v_step[:] = acceleration * self.period, acceleration * self._dt
+        self._v_step[:], self._ramp_limits.v_step[:] = acceleration * self.period, acceleration * self.dt
 
     @property
     def enabled(self) -> Mask:
@@ -200,7 +202,7 @@ class BackupRollouts:
         if steps == 0:
             return trajectory
         start, v, q, policy, score, contact_time, clearance, prediction = trajectory
-        last, elapsed = steps - 1, steps * self._dt
+        last, elapsed = steps - 1, steps * self.dt
         dv = v[last] - (start.v if last == 0 else v[last - 1])
         start = Start(q[last], v[last], dv, start.t + elapsed, start.enabled)
         if score.time_to_contact < HORIZON:
@@ -218,18 +220,23 @@ class BackupRollouts:
         if trajectory.contact_time < start.t + HORIZON - 1e-9:
             return False
         delay, one, two = abs(start.t - trajectory.start.t), trajectory.start.enabled, start.enabled
-        if delay > self._dt or not (one is two or np.array_equal(one, two)):
+        if delay > self.dt or not (one is two or np.array_equal(one, two)):
             return False
-        offset = pin.difference(self._model, trajectory.start.q, start.q)
-        v, dv = np.ascontiguousarray(start.v), np.ascontiguousarray(start.dv)
-        max_offset = self._offset_of_start(self._packed_memory, offset, v, dv, trajectory.v, self._is_accelerated)
-        obstacle_offset = delay * max_obstacle_speed if delay > _ROUND_OFF else 0.0
+        obstacle_offset = delay * max_obstacle_speed if delay > ROUND_OFF else 0.0
         now, then = self._obstacles.prediction, trajectory.prediction
         if now is not then and (len(now.external) or len(then.external)):
             radii = self.query.obstacle_radii
             obstacle_offset += kernels.prediction_error_bound(now, then, HORIZON + BEYOND, radii)
-        clearance = trajectory.clearance - self.lever_arm * max_offset - obstacle_offset
-        return bool(clearance >= self.sufficient_score.clearance)
+        clearance = self.clearance_from(trajectory, start) - obstacle_offset
+        return clearance >= self.sufficient_score.clearance
+
+    def clearance_from(self, trajectory: BackupTrajectory, start: Start) -> float:
+        """Bound the clearance of a trajectory from below that is joined from a start off its own [m]."""
+        q, q_own = start.q, trajectory.start.q
+        offset = q - q_own if self.adds_up else pin.difference(self._model, q_own, q)
+        v, dv = np.ascontiguousarray(start.v), np.ascontiguousarray(start.dv)
+        max_offset = self._offset_of_start(self.packed_memory, offset, v, dv, trajectory.v, self.is_accelerated)
+        return float(trajectory.clearance - self.lever_arm * max_offset)
 
     def rollout(
         self, start: Start, policy: BackupPolicy, prefix: Array | None, must_beat: BackupTrajectory | None
@@ -263,7 +270,8 @@ class BackupRollouts:
         r.q[0], r.v[0], r.dv[:], r.bias_velocity[:] = start.q, start.v, start.dv, policy.bias_velocity
         r.enabled[:] = start.enabled
         in_python = not self._has_kernels or bool(self._obstacles.custom_trajectories)
-        kernels.begin_rollout(self._packed_memory, start.t, policy.horizon, count, *least_score, in_python)
+        memory = self.packed_memory, self.query.packed
+        kernels.begin_rollout(*memory, start.t, policy.horizon, count, *least_score, in_python)
 
     def resume(self, poses: int) -> int:
         """Go on with the rollout until it is FINISHED or DROPPED, or PAUSED after evaluating some poses.
@@ -273,7 +281,7 @@ class BackupRollouts:
         """
         self._poses[0] = poses
         while True:
-            code, *_ = kernels.advance_rollout(self._packed_memory, self.packed, self._prediction)
+            code, *_ = kernels.advance_rollout(self.packed_memory, self.packed, self._prediction)
             if code == TO_MEASURE:
                 self._measure()
             elif code == TO_MOVE:
@@ -290,14 +298,14 @@ class BackupRollouts:
 
     def result(self) -> BackupTrajectory:
         """Return the trajectory that is finished."""
-        steps, time_to_contact, contact_time, clearance = kernels.rollout_outcome(self._packed_memory)
+        steps, time_to_contact, contact_time, clearance = kernels.rollout_outcome(self.packed_memory)
         score = BackupScore(time_to_contact, min(clearance, self.sufficient_score.clearance))
         v, q = self._memory.v[1 : steps + 1].copy(), self._memory.q[1 : steps + 1].copy()
         return BackupTrajectory(self._start, v, q, self._policy, score, contact_time, clearance, self._prediction)
 
     def decision_before(self, start: Start, k: int) -> int:
         """Return the last decision, as a control step, of a trajectory from `start` before step k; 0 without any."""
-        return max(k - (round(start.t / self._dt) + k) % len(self._memory.targets), 0)
+        return max(k - (round(start.t / self.dt) + k) % len(self._memory.targets), 0)
 
     def _measure(self) -> None:
         """Compute the distances of a pose, as far as the kernels did not."""
@@ -309,8 +317,7 @@ class BackupRollouts:
         self.kinematics.compute(self._memory.q_pose)
         if self._has_kernels:  # only trajectories are of another class
             kernels.place_bodies(query.packed, self.kinematics.joint_poses)
-            which, is_first = self._prediction.which, s.span == 0.0
-            near_pairs_along(query.packed, self._memory.pairs, which, is_first, _INFLUENCE_DISTANCE, PREFERRED_DISTANCE)
+            near_pairs_along(query.packed, self._memory.pairs, _INFLUENCE_DISTANCE, PREFERRED_DISTANCE)
             query.finish()
         else:
             query.compute(self.kinematics.joint_poses, _INFLUENCE_DISTANCE)
@@ -321,24 +328,14 @@ class BackupRollouts:
         r, s = self._memory, self._progress
         first, last = s.steps, s.steps + s.count
         for i in range(first, last):
-            r.q[i + 1] = pin.integrate(self._model, r.q[i], self._dt * r.v[i + 1])
+            r.q[i + 1] = pin.integrate(self._model, r.q[i], self.dt * r.v[i + 1])
         r.q_middle[:] = pin.interpolate(self._model, r.q[first], r.q[last], 0.5)
 
 
 def lay_out_pairs(query: DistanceQuery) -> PairMemory:
     """Lay out what a rollout knows of the pairs of a scene."""
-    m, g = len(query.arrays.pairs), len(query.arrays.poses)
-    return PairMemory(
-        radius=query.table.spheres[:, 3],
-        centers=np.zeros((g, 3)),
-        rotations=np.zeros((g, 9)),
-        travels=np.zeros(g),
-        computed=np.zeros(m),
-        limits=np.full(m, -inf),
-        bounds=np.full(m, inf),
-        points=np.zeros((m, 6)),
-        due=np.zeros(m, np.intp),
-    )
+    m = len(query.arrays.pairs)
+    return PairMemory(computed=np.zeros(m), bounds=np.full(m, inf), points=np.zeros((m, 6)), due=np.zeros(m, np.intp))
 
 
 def _ramp_limits(bounds: JointBounds, dt: float) -> RampLimits:
