@@ -76,6 +76,16 @@ def test_dive_at_a_table_brakes_in_time(fraction):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize(("d2", "masses"), [(0.1, 1.2), (0.06, 1.0)])
+def test_rows_that_come_too_late_are_braked_for_ahead(d2, masses):
+    """With a d2 too short to brake in, rows alone let the dive end in the table; the look-ahead keeps it off."""
+    _, closest, figures = play("panda_dive", [f"avoidance.d2={d2}"], mass_scale=masses)
+    assert closest >= D1 - 1e-3 and figures["status_counts"]["STOPPED"] == 0
+    _, closest, _ = play("panda_dive", [f"avoidance.d2={d2}", "avoidance.look_ahead=false"], mass_scale=masses)
+    assert closest < 0.0
+
+
+@pytest.mark.slow
 def test_without_holding_rows_an_arm_of_weak_motors_relaxes_again_and_again():
     """Motors of 70 %, 20 % of the masses unknown: what braking needs is no longer there once gravity takes it."""
     weak = "dynamics.torque_limits=0.7"

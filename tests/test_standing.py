@@ -21,6 +21,8 @@ from qpavoid import (
     build_contacts,
     build_scene,
     build_tasks,
+    load_scenario,
+    simulate,
 )
 from qpavoid.config import Beta, ComTask, Contact, Dynamics, Observer, PlantSettings, PostureTask, Push, Sphere, Task
 
@@ -274,6 +276,25 @@ def test_a_push(g1, controller):
     push = Push(frame="pelvis", force=(0.0, 60.0, 0.0), start=3.2)
     run = play(g1, controller, 4.0, label="60 N", pushes=[push])
     assert not run.has_fallen and run.closest >= 0.0145 and run.slip < 3e-3
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("label", "plant"),
+    [
+        ("exact", {}), ("lighter", {"mass_scale": 0.8}), ("heavier", {"mass_scale": 1.2}),
+        ("floor", {"floor_friction": 0.3}),
+        ("push", {"pushes": [Push(frame="pelvis", force=(0.0, 60.0, 0.0), start=3.2)]}),
+    ],
+)  # fmt: skip
+def test_the_scenario_that_ships(label, plant):
+    """With its own weights, for its 10 s: no foot slips by 1 mm, pushed by 3 mm, and no step is a stop."""
+    log = simulate(load_scenario("g1_wave"), plant=PlantSettings(armature=0.01, friction=0.1, damping=0.1, **plant))
+    closest, figures = float(log.body_distance[:, 1:].min()), log.metrics()
+    slip = figures["torque"]["slip"]
+    print(f"\n{label}: closest {1e3 * closest:.1f}, slip {1e3 * slip:.2f} mm, {figures['status_counts']}")
+    assert log.meta["completed"] and closest >= 0.0145 and slip < (3e-3 if label == "push" else 1e-3)
+    assert figures["status_counts"]["STOPPED"] == 0 and abs(log.q[-1, 2] - log.q[0, 2]) < 0.05
 
 
 @pytest.mark.slow

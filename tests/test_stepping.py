@@ -116,6 +116,7 @@ def test_a_foot_is_lifted_for_a_second_and_set_down(talos):
     assert highest > 0.02
     assert (forces[round((LIFT + 0.3) / DT) : round((DOWN - 0.3) / DT)] == 0.0).all()
     assert forces[-200:].min() > 0.3 * 9.81 * pin.computeTotalMass(talos.model)
+    assert "STOPPED" not in statuses  # bounds admit what a foot asks that comes while it still falls
     assert slip < 5e-3 and np.linalg.norm(body.plant.v) < 0.05
 
 

@@ -169,8 +169,6 @@ class Arbiter:
         if result is None:
             return solution
         v, scale, violation, pair, distance = result
-        if _limits_torques(problem) and distance >= 0.0:
-            return solution
         if violation <= TOLERANCE:
             return solution._replace(v=v, command_scale=scale * solution.command_scale)
         names = self._settings.scene.pair_names[pair]

@@ -7,6 +7,9 @@ that path are evaluated. Where a pair comes too near, a solution of less effort 
 that is scaled towards the stop of this control step, whose path was verified one step ago. By induction a verified stop
 is always available, as long as obstacles keep their velocities for one control period.
 
+At the torque level rows keep the margins, and the look-ahead keeps off contact alone: it counts on the acceleration
+that torques leave, and takes no more of the velocity away than that needs.
+
 Most control steps need none of this: where no body moves fast enough, or not in the direction, to use up the margin of
 a pair before the robot could stop, the velocity is clear (`kernels.clearance_lower_bound`, with the bound and its
 proof).
@@ -152,16 +155,20 @@ class BrakingCheck:
         least = self._least(q, v)
         if least.margin >= 0.0:
             return None
+        limits_torques = problem.dynamics is not None and problem.dynamics.torque_rows > 0
+        if limits_torques and least.distance >= 0.0:
+            return (
+                None  # d1 is kept by the rows, which see in every step what is wrong with a model, as a stop does not
+            )
         best, cost = BrakingResult(v, 1.0, -least.margin, least.pair, least.distance), -least.margin
-        if problem.dynamics is not None and problem.dynamics.torque_rows:
-            return best  # rows see in every step what is wrong with a model, a stop does not
         straight = low_effort(problem, slack)
         full, scales = (v, _SCALES) if straight is None else (straight, (1.0, *_SCALES))
         for scale in scales:
             blend = v_stop + scale * (full - v_stop)
             least = self._least(q, blend)
             # a stop was clear one control step ago
-            if least.margin >= (-_REFINEMENT_ERROR if self._has_jerks and scale == 0.0 else 0.0):
+            clear = -_REFINEMENT_ERROR if self._has_jerks and scale == 0.0 else 0.0
+            if least.margin >= clear or (limits_torques and least.distance >= 0.0):
                 return BrakingResult(blend, scale, 0.0, -1, least.distance)
             excess = rows.b - rows.J @ blend - (0.0 if slack is None else slack)
             tried = _VIOLATION_TIME * float(np.max(excess, initial=0.0)) - least.margin
