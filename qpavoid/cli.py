@@ -20,14 +20,14 @@ import typer
 from rich.markup import escape
 from rich.progress import Progress, TaskID
 
-from qpavoid.config import RobotConfig, ScenarioConfig
+from qpavoid.config import Planning, RobotConfig, ScenarioConfig
 from qpavoid.config.fields import page, schema_of
 from qpavoid.config.loading import load_scenario
 from qpavoid.config.shipped import shipped_names
 from qpavoid.controller import Controller
 from qpavoid.errors import ConfigError, QpavoidError
 from qpavoid.kernels.cache import FOLDER
-from qpavoid.run.log import Log
+from qpavoid.run.log import WITH_PLANNING, Log
 from qpavoid.run.report import events, failed, metrics_table, to_json
 from qpavoid.run.simulate import simulate
 from qpavoid.run.terminal import ERR, OUT, names_of, progress, terminate_like_interrupt
@@ -130,6 +130,9 @@ def compare(
     solvers: Annotated[
         str, typer.Option(help="Comma-separated; FILE.py:NAME for one of your own.")
     ] = "tracking,eq10-literal,eq10,qp",
+    planning: Annotated[
+        bool, typer.Option("--planning", help="Run qp and hqp a second time, with `planning: {}` in the scenario.")
+    ] = False,
     set_: Sets = None,
     out: Out = Path("out"),
     json: Json = False,
@@ -142,6 +145,8 @@ def compare(
     """
     names = names_of("--solvers", solvers)
     jobs = [_job(scenario, set_, name) for scenario in scenarios for name in names]
+    if planning:
+        jobs = [twin for job in jobs for twin in job.with_and_without_planning()]
     logs, files = _run_all(jobs, out)
     if figures:
         files += _draw(logs, out)
@@ -215,7 +220,15 @@ class _Job(NamedTuple):
     @property
     def label(self) -> str:
         """Scenario and solver, for messages and names of files."""
-        return f"{self.config.source.stem} {(self.law or self.config.solver).label}"
+        label = f"{self.config.source.stem} {(self.law or self.config.solver).label}"
+        return f"{label} {WITH_PLANNING}" if self.config.planning else label
+
+    def with_and_without_planning(self) -> list[_Job]:
+        """Return the run without planning, and with it, where it is of a law that is forecast."""
+        if self.law is not None or self.config.solver.name not in ("qp", "hqp"):
+            return [self]
+        blocks = None, self.config.planning or Planning()
+        return [self._replace(config=self.config.model_copy(update={"planning": block})) for block in blocks]
 
 
 def _job(scenario: str, sets: list[str] | None, solver: str | None) -> _Job:
@@ -244,7 +257,7 @@ def _run_all(jobs: list[_Job], out: Path) -> tuple[list[Log], list[Path]]:
         for label, (config, law) in zip(labels, jobs, strict=True):
             update = partial(_update, bar, bar.add_task(label, total=None))
             logs.append(simulate(config, law, update))
-            files.append(logs[-1].save(out / f"{label.replace(' ', '_').replace(':', '-')}.npz"))
+            files.append(logs[-1].save(out / f"{logs[-1].stem}.npz"))
             if logs[-1].meta["stopped_by"]:
                 message = escape(f"{label}: broken off: {logs[-1].meta['stopped_by']}")
                 ERR.print(f"[red]{message}[/]", highlight=False)

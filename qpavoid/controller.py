@@ -229,7 +229,8 @@ class Controller(SceneChanges, SplitStep):
         """
         begin, builder = perf_counter(), self._builder
         step = builder.begin(q, t, targets, obstacles, v)
-        if step.is_plain and self._planning is None and self._arbiter.accepts(step.t):
+        planning = self._planning
+        if step.is_plain and (planning is None or planning.leaves_alone(step)) and self._arbiter.accepts(step.t):
             middle, v = perf_counter(), builder.rows.v.copy()
             builder.remember(v)
             return Solution.solved(v, step.assumptions, middle - begin, perf_counter() - middle)

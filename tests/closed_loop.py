@@ -159,6 +159,9 @@ class Awaited(ProcessWorker):
         super().ask(question)
         self.is_asked = True
 
+    def has_answer(self):
+        return self.is_asked or super().has_answer()
+
     def poll(self):
         answer = None
         while self.is_asked and answer is None and self.process.poll() is None:

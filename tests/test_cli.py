@@ -112,6 +112,13 @@ def test_compare_keeps_a_log_of_each_solver(cli):
     assert [Log.load(file).meta["solver"] for file in document["files"]] == solvers
 
 
+def test_compare_with_and_without_planning(cli, scene):
+    result = cli("compare", scene(), "--solvers", "eq10,qp", "--planning", "--json", "--no-figures")
+    document = json.loads(result.stdout)
+    assert [run["solver"] for run in document["runs"]] == ["eq10", "qp", "qp with planning"]
+    assert len({Path(file).name for file in document["files"]}) == 3
+
+
 LAWS = """
 import numpy as np
 from qpavoid import Solution, Solver

@@ -22,7 +22,7 @@ from qpavoid.config.control import FastFinish
 from qpavoid.control.scenario import build_parts
 from qpavoid.control.settings import ControlSettings
 from qpavoid.planning.drive import TRACK
-from qpavoid.planning.forecast import Forecaster, Snapshot
+from qpavoid.planning.forecast import MAX_SPREAD, Forecaster, Snapshot
 from qpavoid.reason import ReasonKind
 
 TOO_FAR = (0.0, 0.3, 0.0)
@@ -62,6 +62,16 @@ def test_forecast_is_what_the_law_does(name, limits):
     log, ahead = simulate(scenario), forecast(scenario)
     assert ahead.q.tobytes() == log.q.tobytes()
     assert ahead.v[1:].tobytes() == log.v[:-1].tobytes()
+
+
+def test_margin_of_obstacles_that_turn_grows_in_forecasts():
+    """With it, the robot keeps farther from where they really are; the next forecast knows nothing of it."""
+    forecaster, start = make_forecaster(load_scenario("chasing_sphere"))
+    fist = forecaster.scene.obstacles[0]
+    start = start._replace(obstacles={fist.name: fist.motion.sample(0.0).row.copy()})
+    without, wary = forecaster.run(start, 2.0), forecaster.run(start._replace(spread=0.1), 2.0)
+    assert without.clearance[-1] > wary.clearance[-1] > without.clearance[-1] - MAX_SPREAD + 0.01
+    assert forecaster.run(start, 2.0).q.tobytes() == without.q.tobytes()
 
 
 def reaching(panda, **changes):

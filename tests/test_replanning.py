@@ -5,7 +5,7 @@ import pytest
 from closed_loop import Awaited
 
 from qpavoid import Controller, Obstacle, Points, Sample, build_scene, build_tasks
-from qpavoid.config import Box, Capsule, Planning, PointCloud, Task
+from qpavoid.config import Box, Capsule, Planning, PointCloud, Sphere, Task
 from qpavoid.planning import worker
 from qpavoid_bench.arena.entrants import ENTRANTS
 from qpavoid_bench.arena.families import load_family, make_case
@@ -49,13 +49,53 @@ def test_where_the_law_arrives_commands_are_those_of_the_law(family, seed):
 
 
 class Counted(worker.InlineWorker):
-    """A worker that counts the looks."""
+    """A worker that counts the looks, and keeps their times."""
 
-    looks = 0
+    looks, times = 0, []
 
     def ask(self, question):
         super().ask(question)
         type(self).looks += 1
+        self.times.append(question.start.t)
+
+
+class Slow(worker.InlineWorker):
+    """A worker whose answers are two seconds late."""
+
+    steps = 0
+
+    def poll(self):
+        answer, self.steps = None, self.steps + (self._answer is not None)
+        if self.steps > 200:
+            answer, self.steps = super().poll(), 0
+        return answer
+
+
+def test_obstacle_that_turns_is_looked_at_at_once(panda, monkeypatch):
+    """Looks are periodic while a ball goes straight on; two steps after it has turned, there is one."""
+    monkeypatch.setattr(Counted, "times", [])
+    monkeypatch.setattr(worker, "InlineWorker", Counted)
+    scene = build_scene(panda, [Obstacle.at("ball", Sphere(radius=0.05), [0.9, 0.0, 0.9], external=True)])
+    tasks = build_tasks([Task(frame="panda_hand_tcp")], panda, panda.home)
+    controller = Controller(scene, tasks, planning=Planning(settle=0.5, clearances=[], fast=None))
+    position, velocity = np.array([0.9, -0.3, 0.9]), np.array([0.0, 0.2, 0.0])
+    for k in range(120):
+        if k == 90:
+            velocity = np.array([0.0, 0.0, 0.2])
+        ball = Sample.at(position, np.eye(3), linear=velocity)
+        controller.step(panda.home, 0.01 * k, obstacles={"ball": ball})
+        position = position + 0.01 * velocity
+    np.testing.assert_allclose(Counted.times, [0.0, 0.4, 0.8, 0.9], atol=0.021)
+
+
+def test_answer_that_is_two_seconds_late_changes_nothing(monkeypatch):
+    """Commands are those of the law, bit for bit, while it is awaited, and what comes too late is not followed."""
+    case = make_case(load_family("shelf"), 1)
+    of_law = roll(case, "qp").v
+    monkeypatch.setattr(worker, "InlineWorker", Slow)
+    late = roll(case).v
+    assert late[:200].tobytes() == of_law[:200].tobytes()
+    assert np.isfinite(late).all()
 
 
 @pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.slow), pytest.param(2, marks=pytest.mark.slow)])

@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 import os
+import signal
+import subprocess
+import sys
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from time import perf_counter_ns, sleep
+from time import perf_counter_ns, sleep, thread_time_ns
 from typing import Annotated, Any
 
 import numpy as np
@@ -25,6 +29,10 @@ _BLOCKS = 10
 """Blocks of each loop, in turn [-]."""
 _LEAD_IN = 100
 """Steps of each block that are not timed [-]."""
+_ALONE, _PLANS, _BESIDE = "none", "process", "none, beside a busy program"
+"""What goes on beside a loop."""
+_BUSY = "from qpavoid_bench.planning import control_for_ever; control_for_ever()"
+"""What the busy program runs."""
 
 
 def planning(
@@ -47,38 +55,73 @@ def _sections(steps: int) -> Iterator[str]:
         "`nothing to plan`: the motions of all obstacles are known, so that the process looks ahead at the start and "
         "then rests. `always planning`: obstacles that move are given to each step, and the next look is asked for as "
         "soon as the one before is answered. `core`: of the process, of one core. `late`: how long after its time a "
-        "step begins."
+        "step begins. Beside a busy program, nothing is planned, while another process computes control steps of the "
+        "same scene without a pause and without a word: what that costs the loop, caches, memory and cores do, and not "
+        "planning. `CPU`: the processor's time of a step's thread."
     )
     head = ["loop", "planning", "", "p50 [µs]", "p99 [µs]", "p99.9 [µs]", "worst [µs]", "core"]
     rows, notes = [], []
     for name, is_given in (("nothing to plan", False), ("always planning", True)):
         result = _compare(is_given, steps)
-        for planned, (ns, load) in result.items():
-            for row, part in enumerate(("step", "late")):
+        for beside, (ns, load) in result.items():
+            for row, part in enumerate(("step", "CPU", "late")):
                 cells = [number(float(x)) for x in 1e-3 * np.percentile(ns[row], [50, 99, 99.9, 100])]
-                busy = f"{100 * load:.0f} %" if planned and not row else ""
-                rows.append([name, "process" if planned else "none", part, *cells, busy])
-        without, plans = (1e-3 * np.percentile(result[planned][0][0], [50, 99]) for planned in (False, True))
-        notes.append(
-            f"{name}: the median step takes {plans[0] / without[0]:.2f} times as long, "
-            f"p99 is {plans[1] - without[1]:+.1f} µs."
-        )
+                busy = f"{100 * load:.0f} %" if beside != _ALONE and not row else ""
+                rows.append([name, beside, part, *cells, busy])
+        notes += [_compare_parts(name, result, other) for other in (_ALONE, _BESIDE) if other in result]
     yield table(head, rows, text_columns=3)
-    yield " ".join(notes)
+    yield "\n".join(f"- {note}" for note in notes)
 
 
-def _compare(is_given: bool, steps: int) -> dict[bool, tuple[Any, float]]:
-    """Return times of steps and their lateness (2, steps) [ns], and the load of a core by the process."""
-    loops = {planned: _make_loop(is_given, planned) for planned in (False, True)}
-    times: dict[bool, list[Any]] = {False: [], True: []}
-    loads: dict[bool, list[float]] = {False: [], True: []}
-    for part in range(2 * _BLOCKS):
-        planned = bool(part % 2)
-        _pace(loops[planned], _LEAD_IN)
-        begin, used = perf_counter_ns(), _seconds_of_children()
-        times[planned].append(_pace(loops[planned], steps // _BLOCKS))
-        loads[planned].append((_seconds_of_children() - used) / (1e-9 * (perf_counter_ns() - begin)))
-    return {planned: (np.concatenate(times[planned], axis=1), float(np.mean(loads[planned]))) for planned in times}
+def _compare_parts(name: str, result: dict[str, tuple[Any, float]], other: str) -> str:
+    """Return in a sentence how times of steps with planning compare with those of another loop."""
+    parts = []
+    for row, part in ((0, "step"), (1, "CPU")):
+        without, plans = (1e-3 * np.percentile(result[beside][0][row], [50, 99]) for beside in (other, _PLANS))
+        parts.append(f"{part}: median {plans[0] / without[0]:.2f} times, p99 {plans[1] - without[1]:+.1f} µs")
+    return f"{name}, with the process against {other}: {'; '.join(parts)}."
+
+
+def _compare(is_given: bool, steps: int) -> dict[str, tuple[Any, float]]:
+    """Return times (3, steps) [ns] by what goes on beside the loop, see `_pace`, and the load of a core by that."""
+    loops = {_ALONE: _make_loop(is_given, False), _PLANS: _make_loop(is_given, True)}
+    if is_given:
+        loops[_BESIDE] = loops[_ALONE]
+    times: dict[str, list[Any]] = {beside: [] for beside in loops}
+    loads: dict[str, list[float]] = {beside: [] for beside in loops}
+    with _busy_program() as busy:
+        for _ in range(_BLOCKS):
+            for beside, loop in loops.items():
+                if beside == _BESIDE:
+                    busy.send_signal(signal.SIGCONT)
+                _pace(loop, _LEAD_IN)
+                begin, used = perf_counter_ns(), _seconds_of_children()
+                times[beside].append(_pace(loop, steps // _BLOCKS))
+                loads[beside].append((_seconds_of_children() - used) / (1e-9 * (perf_counter_ns() - begin)))
+                busy.send_signal(signal.SIGSTOP)
+    return {beside: (np.concatenate(times[beside], axis=1), float(np.mean(loads[beside]))) for beside in loops}
+
+
+@contextmanager
+def _busy_program() -> Iterator[subprocess.Popen[bytes]]:
+    """Start a program that computes control steps for ever, and stop it until it gets a SIGCONT."""
+    busy = subprocess.Popen([sys.executable, "-c", _BUSY], stdout=subprocess.PIPE)
+    try:
+        assert busy.stdout is not None
+        busy.stdout.readline()
+        busy.send_signal(signal.SIGSTOP)
+        yield busy
+    finally:
+        busy.kill()
+        busy.wait()
+
+
+def control_for_ever() -> None:
+    """Compute control steps of the scene without a pause; say so once they begin."""
+    loop = _make_loop(True, False)
+    print("begins", flush=True)
+    while True:
+        loop.advance(loop.step(None, None))
 
 
 class _Given(Loop):
@@ -109,16 +152,17 @@ def _make_loop(is_given: bool, planned: bool) -> Loop:
 
 
 def _pace(loop: Loop, count: int) -> Any:
-    """Run steps at their times; return how long they take, and how late they begin (2, count) [ns]."""
-    ns, period = np.zeros((2, count), dtype=np.int64), round(1e9 * _DT)
+    """Run steps at their times; return how long they take, of that on a processor, how late they begin (3, n) [ns]."""
+    ns, period = np.zeros((3, count), dtype=np.int64), round(1e9 * _DT)
     due = perf_counter_ns()
     for k in range(count):
         due += period
         sleep(max(0.0, 1e-9 * (due - perf_counter_ns())))
-        begin = perf_counter_ns()
+        begin, used = perf_counter_ns(), thread_time_ns()
         v = loop.step(None, None)
-        ns[:, k] = perf_counter_ns() - begin, begin - due
-        if ns[1, k] > 20 * period:
+        used = thread_time_ns() - used
+        ns[:, k] = perf_counter_ns() - begin, used, begin - due
+        if ns[2, k] > 20 * period:
             due = perf_counter_ns()
         loop.advance(v)
     return ns

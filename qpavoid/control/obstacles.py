@@ -145,6 +145,11 @@ class ObstacleTracker:
         extrapolate(states, duration)
         return self.current._replace(states=states)
 
+    def widen(self, which: Sequence[int], margin: float) -> None:
+        """Take some obstacles for farther from where they are seen from the next step on, by a margin more [m]."""
+        for index in which:
+            self._uncertainty[index] = self._obstacles[index].uncertainty + margin
+
     def put(self, index: int, name: str, present: bool) -> None:
         """Take over what the scene has in a spare slot now.
 

@@ -64,7 +64,7 @@ from qpavoid.kernels.step import (
     tracking_violation,
     violation,
 )
-from qpavoid.kernels.straying import any_displaced, any_moves, strays, surprise
+from qpavoid.kernels.straying import any_moves, any_off_course, strays, surprise
 from qpavoid.kernels.structures import direct, pack
 from qpavoid.kernels.task_curvature import add_curvature
 from qpavoid.kernels.tasks import frame_rows, projection_cost
@@ -96,8 +96,8 @@ __all__ = [
     "add_curvature",
     "advance_rollout",
     "alpha",
-    "any_displaced",
     "any_moves",
+    "any_off_course",
     "assemble",
     "backup_rows",
     "begin_rollout",

@@ -56,20 +56,31 @@ def any_moves(states: Array, which: IntArray) -> bool:
 
 
 @compiled
-def any_displaced(states: Array, which: IntArray, earlier: Array, moved: float, turned: float) -> bool:
-    """Return whether any of k obstacles is elsewhere than before.
+def any_off_course(
+    states: Array, which: IntArray, earlier: Array, elapsed: float, horizon: float, moved: float, turned: float
+) -> bool:
+    """Return whether any of k obstacles is, or soon will be, elsewhere than its velocity of before leads to.
+
+    The rotation of one that turns does not count.
 
     Args:
         states: of all obstacles (o, 18).
         which: their numbers (k,).
         earlier: their states before (k, 18).
+        elapsed: time since then [s].
+        horizon: time for which their velocities of now lead on [s].
         moved: difference of a coordinate that does not count [m].
         turned: the same of an element of the rotation [-].
     """
     for k in range(len(which)):
-        for c in range(12):
-            if abs(states[which[k], c] - earlier[k, c]) > (turned if c < 9 else moved):
+        for c in range(9, 12):
+            there = earlier[k, c] + (elapsed + horizon) * earlier[k, c + 3]
+            if abs(states[which[k], c] + horizon * states[which[k], c + 3] - there) > moved:
                 return True
+        if earlier[k, 15] == 0.0 and earlier[k, 16] == 0.0 and earlier[k, 17] == 0.0:
+            for c in range(9):
+                if abs(states[which[k], c] - earlier[k, c]) > turned:
+                    return True
     return False
 
 

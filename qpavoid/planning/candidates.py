@@ -7,6 +7,7 @@ it begins. What is tried is limited by counts, not by time: the same state has t
 from __future__ import annotations
 
 from collections.abc import Iterator
+from math import isfinite
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -75,7 +76,7 @@ def is_sound(outcome: Outcome, model: Any) -> bool:
     if path is not None:
         count = max(len(path.t), 2)
         parts += [(path.t, (count,)), (path.q, (count, model.nq)), (path.coordinates, (count, model.nv))]
-    return all(array.shape == shape and bool(np.isfinite(array).all()) for array, shape in parts)
+    return all(array.shape == shape and isfinite(array.sum()) for array, shape in parts)
 
 
 class _Candidate(NamedTuple):
@@ -105,12 +106,12 @@ class Candidates:
             seed: of the planner.
         """
         end = self._forecaster.end_of(start)
-        present = self._forecaster.run(start, end)
+        present = self._forecaster.run(start._replace(spread=0.0), end)
         if self._arrives(present):
             return Outcome(True, present.expected)
         if is_noisy and start.drive.mode is Mode.TRACK:
             return Outcome(False, present.expected)
-        search = _Search(start, end, present, is_moving, seed, _STEP_TIME * len(present.t))
+        search = _Search(start, end, present, is_moving, is_noisy, seed, _STEP_TIME * len(present.t))
         better = [*self._faster(search)]
         hurried = [one for one in better if one.arrives and one.cost < 1.1 * present.rms_error]
         if self._planner is not None and not is_noisy and not (hurried and is_moving):
@@ -123,13 +124,14 @@ class Candidates:
         return Outcome(False, present.expected, Decision(best.t, drive, best.forecast.expected))
 
     def _faster(self, search: _Search) -> Iterator[_Candidate]:
-        """Roll out the other of tasks with the rows of the law, and of a fast finish."""
+        """Roll out those of tasks with the rows of the law, and of a fast finish, that are not followed."""
         mode, step = search.start.drive.mode, search.present.step_at(search.start.t + self._config.lead)
-        if mode is Mode.FOLLOW or step >= len(search.present.t) - 1:
+        if step >= len(search.present.t) - 1:
             return
-        hurries = mode is Mode.TRACK and self._config.fast is not None
-        if hurries or mode is Mode.FAST:
-            yield from self._try(search, step, TRACK if mode is Mode.FAST else Drive(Mode.FAST), _WORTH_HURRY)
+        if mode is not Mode.TRACK:
+            yield from self._try(search, step, TRACK, _WORTH_HURRY)
+        if mode is not Mode.FAST and self._config.fast is not None and not search.is_noisy:
+            yield from self._try(search, step, Drive(Mode.FAST), _WORTH_HURRY)
 
     def _paths(self, search: _Search, planner: Planner) -> Iterator[_Candidate]:
         """Roll out paths that leave the forecast at several times, and join the motions of the targets again."""
@@ -218,9 +220,10 @@ class _Search:
     """What is known in a look ahead."""
 
     def __init__(
-        self, start: Snapshot, end: float, present: Forecast, is_moving: bool, seed: int, effort: float
+        self, start: Snapshot, end: float, present: Forecast, is_moving: bool, is_noisy: bool, seed: int, effort: float
     ) -> None:
-        self.start, self.end, self.present, self.is_moving, self.seed = start, end, present, is_moving, seed
+        self.start, self.end, self.present, self.seed = start, end, present, seed
+        self.is_moving, self.is_noisy = is_moving, is_noisy
         self.effort = effort
         """Time that it is taken to have needed so far [s]."""
 

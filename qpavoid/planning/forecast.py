@@ -28,6 +28,8 @@ from qpavoid.reason import Reason
 from qpavoid.safety.arbiter import Arbiter
 from qpavoid.solvers import make_solver
 
+MAX_SPREAD = 0.03
+"""Largest margin for where obstacles may get that do not go on as they do now [m]: with more, nothing arrives."""
 _PRESENT = 1e-3
 """How much nearer than it is now a pair may come that is too near [m]."""
 
@@ -51,6 +53,8 @@ class Snapshot(NamedTuple):
     """What is in point clouds among them that were given points."""
     targets: Mapping[str, Any]
     """Targets that a program gives, by name of the task; they are taken to stay where they are."""
+    spread: float = 0.0
+    """Rate at which a margin around the `obstacles` grows, up to `MAX_SPREAD` [m/s]: they may turn."""
 
 
 class Expected(NamedTuple):
@@ -168,10 +172,12 @@ class Forecaster(SceneChanges):
         errors, clearance = np.zeros((count + 1, len(rows.frame_errors))), np.full(count + 1, np.inf)
         q[0], v[0], dv[0] = start.q, start.v, start.dv
         self._restart(start)
-        obstacles = _updates(start)
+        obstacles, spreading = _updates(start), [builder.tracker.index(name) for name in start.obstacles]
         stalled: tuple[Reason, ...] = ()
         for k in range(count + 1):
             updates = obstacles if k == 0 else None
+            if start.spread or k == 0:  # the forecast before may have left a margin
+                builder.tracker.widen(spreading, min(k * dt * start.spread, MAX_SPREAD))
             step = builder.build(builder.read(q[k], start.t + k * dt, start.targets or None, updates, None))
             distances = rows.problem().avoidance
             if k == 0:
@@ -202,11 +208,13 @@ class Forecaster(SceneChanges):
         """Return where obstacles are at a time [s], as known in the state in which a forecast begins."""
         tracker = self._builder.tracker
         states = tracker.at(t).states.copy()
+        margin = np.array([obstacle.uncertainty for obstacle in self.scene.slots])
         for name, row in start.obstacles.items():
             index = tracker.index(name)
             states[index] = row
             extrapolate(states[index : index + 1], t - start.t)
-        return tracker.current._replace(states=states)
+            margin[index] += min((t - start.t) * start.spread, MAX_SPREAD)
+        return tracker.current._replace(states=states, margin=margin)
 
     def targets_at(self, start: Snapshot, t: float) -> dict[str | tuple[str, str], Any]:
         """Return targets of the frames at a time [s], in the axes of the world or of another frame."""

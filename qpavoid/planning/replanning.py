@@ -14,7 +14,7 @@ from qpavoid.control.contacts import ContactRows
 from qpavoid.control.settings import ControlSettings
 from qpavoid.control.tasks import FrameTask, RowTask
 from qpavoid.model.cloud import Voxels
-from qpavoid.model.sample import STATE, Sample
+from qpavoid.model.sample import POSE, STATE, Sample
 from qpavoid.planning.candidates import Decision, is_sound
 from qpavoid.planning.drive import TRACK, Driver
 from qpavoid.planning.forecast import Expected, Snapshot
@@ -31,6 +31,10 @@ _CHANGED = 0.02
 """Difference of a task's error, or of an obstacle's position, from the forecast, after which it does not count [m]."""
 _TURNED = 0.1
 """The same of a joint, or of an obstacle's orientation [rad]."""
+_STEADY = 1e-3
+"""Rate at which obstacles may leave their courses that counts as none [m/s]: round-off, and slow turns."""
+_SOONEST = 0.1
+"""Time after a look at which an obstacle that has left its course lets the next one begin [s]."""
 _NOISE = 1e-3
 """Root mean square of what an obstacle's position differs from that of a step before and its twist, from which on
 twists are too noisy to plan with [m]: at 10 m/s², it is half as much."""
@@ -81,7 +85,7 @@ class Replanning:
         which, states = self._builder.tracker.external[:0], self._builder.tracker.current.states
         q, errors = self._builder.rows.q, self._builder.rows.frame_errors
         kernels.strays(q, errors, 0.0, np.zeros(1), q[None].copy(), np.zeros(1), _CHANGED, _TURNED)
-        kernels.any_displaced(states, which, _NO_STATES, _CHANGED, _TURNED)
+        kernels.any_off_course(states, which, _NO_STATES, 0.0, 0.0, _CHANGED, _TURNED)
         kernels.any_moves(states, which)
         kernels.surprise(states, which, _NO_STATES, self._settings.dt)
 
@@ -97,6 +101,8 @@ class Replanning:
         self._looks = 0
         self._last_states = _NO_STATES  # in the step before
         self._noise, self._measured = 0.0, 0  # mean square [m²], number of differences
+        self._compared_at = -np.inf  # step of the last difference [s]
+        self._spread = 0.0  # mean square of the rate at which obstacles left their courses between looks [m²/s²]
 
     def change_law(self, law: Solver) -> None:
         """Forecast another law from now on; nothing is forecast if the first one could not be."""
@@ -118,6 +124,22 @@ class Replanning:
             self._worker.change(method, *arguments)
         self.reset()
 
+    def leaves_alone(self, step: StepProblem) -> bool:
+        """Return whether a step is the law's alone: nothing is followed, to ask, to take over or to say."""
+        worker = self._worker
+        if worker is None or self._driver.drive is not TRACK or self._pending is not None:
+            return False
+        if self._no_plan is not None or self._notes:
+            return False
+        self._compare(step.t)
+        return not (worker.has_answer() or (self._question is None and self._is_due(step)))
+
+    def _compare(self, t: float) -> None:
+        """Compare obstacles that a program gives with what the step before led to, once in each step."""
+        if t != self._compared_at and len(self._builder.tracker.external):
+            self._compared_at = t
+            self._measure_noise()
+
     def decide(self, step: StepProblem) -> Solution:
         """Return the solution of a step, and look ahead from it where that is due."""
         if step.resumed:
@@ -126,8 +148,7 @@ class Replanning:
         if self._pending is not None and step.t > self._pending.t + dt:  # steps were left out, or stops
             self._pending, self._next_look = None, step.t
         if self._no_plan is None and worker is not None:
-            if len(self._builder.tracker.external):
-                self._measure_noise()
+            self._compare(step.t)
             if self._pending is None and self._question is None and self._is_due(step):
                 self._ask(step, worker)
             if (answer := worker.poll()) is not None:
@@ -150,7 +171,10 @@ class Replanning:
         """Return whether to look ahead: time has come, or what was forecast does not come true."""
         if step.t >= self._next_look - _ROUND_OFF:
             return True
-        return step.t >= self._last_look + self._config.period - _ROUND_OFF and self._has_changed(step)
+        since = step.t - self._last_look + _ROUND_OFF
+        if since >= self._config.period:
+            return self._has_changed(step)
+        return since >= _SOONEST and not self._is_noisy and self._is_off_course(step.t)
 
     def _has_changed(self, step: StepProblem) -> bool:
         """Return whether robot, targets or obstacles are elsewhere than in the forecast."""
@@ -161,14 +185,23 @@ class Replanning:
             step.q, self._builder.rows.frame_errors, step.t, expected.t, expected.q, expected.errors, _CHANGED, _TURNED
         ):
             return True
-        which, states = tracker.external, tracker.current.states
-        if len(which) != len(self._asked_states):
-            return True
         if any(voxels is not self._asked_clouds.get(i) for i, voxels in tracker.current.voxels.items()):
             return True
-        if not len(which) or kernels.any_moves(states, which):
-            return False  # then looks are periodic
-        return bool(kernels.any_displaced(states, which, self._asked_states, _CHANGED, _TURNED))
+        return self._is_off_course(step.t)
+
+    def _is_off_course(self, t: float) -> bool:
+        """Return whether an obstacle that a program gives is elsewhere than the last look had it, at a time [s]."""
+        which, states = self._builder.tracker.external, self._builder.tracker.current.states
+        if len(which) != len(self._asked_states):
+            return True
+        elapsed = t - self._last_look
+        horizon = self._config.period
+        return bool(kernels.any_off_course(states, which, self._asked_states, elapsed, horizon, _CHANGED, _TURNED))
+
+    @property
+    def _is_noisy(self) -> bool:
+        """Whether twists are too noisy to plan with, or it is not known yet."""
+        return self._measured < _MEASURED or self._noise > _NOISE**2
 
     def _measure_noise(self) -> None:
         """Compare positions of obstacles with those that the twists of the step before lead to."""
@@ -181,18 +214,31 @@ class Replanning:
         else:
             self._last_states = states[which]
 
+    def _measure_spread(self, states: Array, elapsed: float) -> None:
+        """Compare obstacles (k, 18) with where the look before had them, some time ago [s]."""
+        earlier = self._asked_states
+        if len(states) == 0 or len(earlier) != len(states) or not elapsed > 0.0:
+            return
+        off = states[:, 9:12] - earlier[:, 9:12] - elapsed * earlier[:, 12:15]
+        rate = float(np.sqrt((off * off).sum(axis=1).max())) / elapsed
+        self._spread += 0.5 * ((rate if rate > _STEADY else 0.0) ** 2 - self._spread)
+
     def _ask(self, step: StepProblem, worker: Worker) -> None:
         """Ask for a look ahead from a step."""
         tracker, previous = self._builder.tracker, self._builder.rows.previous
         slots, states = self._settings.scene.slots, tracker.current.states
         asked, clouds = states[tracker.external], dict(tracker.current.voxels)
+        is_moving = bool(kernels.any_moves(states, tracker.external))
+        is_noisy = is_moving and self._is_noisy
+        self._measure_spread(asked, step.t - self._last_look)
+        if is_noisy:  # a single twist is no base for what an obstacle does in a second; the mean of late is
+            asked[:, POSE:] = tracker.twists[tracker.external]
         self._asked_states, self._asked_clouds = asked, clouds
         obstacles = {slots[i].name: state for i, state in zip(tracker.external.tolist(), asked, strict=True)}
         points = {name: clouds[i] for i, name in zip(tracker.external.tolist(), obstacles, strict=True) if i in clouds}
-        is_moving = bool(kernels.any_moves(states, tracker.external))
-        is_noisy = is_moving and (self._measured < _MEASURED or self._noise > _NOISE**2)
         q, v, dv = step.q.copy(), previous.v.copy(), previous.dv.copy()
-        start = Snapshot(step.t, q, v, dv, self._driver.drive, obstacles, points, self._given_targets(step))
+        given, spread = self._given_targets(step), float(np.sqrt(self._spread)) if is_moving else 0.0
+        start = Snapshot(step.t, q, v, dv, self._driver.drive, obstacles, points, given, spread)
         self._number += 1
         self._question = Question(self._number, start, is_moving, is_noisy, self._looks)
         self._looks += 1

@@ -73,6 +73,9 @@ class Worker(Protocol):
     def ask(self, question: Question) -> None:
         """Ask for a look ahead; one at a time."""
 
+    def has_answer(self) -> bool:
+        """Return whether `poll` has anything to say."""
+
     def poll(self) -> Answer | None:
         """Return an answer, if there is one; never wait."""
 
@@ -99,6 +102,10 @@ class InlineWorker:
             self._answer = Answer(question.number, None, f"{type(error).__name__}: {error}")
         else:
             self._answer = Answer(question.number, outcome, no_paths=self._no_paths)
+
+    def has_answer(self) -> bool:
+        """See `Worker`."""
+        return self._answer is not None
 
     def poll(self) -> Answer | None:
         """See `Worker`."""
@@ -128,6 +135,10 @@ class ProcessWorker:
     def ask(self, question: Question) -> None:
         """See `Worker`."""
         self._messages.put(question)
+
+    def has_answer(self) -> bool:
+        """See `Worker`."""
+        return not self._answers.empty()
 
     def poll(self) -> Answer | None:
         """See `Worker`."""

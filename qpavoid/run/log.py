@@ -18,6 +18,8 @@ from qpavoid.run.metrics import path_deviation, torque_figures
 
 STATUSES = tuple(Status)
 """Status of each code in `Log.status`."""
+WITH_PLANNING = "with planning"
+"""Ends the name of a solver in runs with planning."""
 _FORMAT = 9
 _SHAPES = {
     "t": "N", "q": "N nq", "v": "N nv",
@@ -114,6 +116,11 @@ class Log:
         sides = {"2": 2, "3": 3, **sizes}
         shapes = {name: [sides[letter] for letter in letters.split()] for name, letters in _SHAPES.items()}
         return {name: np.zeros(shape, dtype=_TYPES.get(name, np.float64)) for name, shape in shapes.items()}
+
+    @property
+    def stem(self) -> str:
+        """Return what files of the run begin with: scenario and solver."""
+        return f"{self.meta['scenario']}_{self.meta['solver']}".replace(":", "-").replace(" ", "_")
 
     @property
     def min_distance(self) -> Array:

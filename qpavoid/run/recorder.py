@@ -22,7 +22,7 @@ from qpavoid.model.sample import POSE, STATE
 from qpavoid.model.scene import PARKING_DISTANCE, Obstacle, Scene
 from qpavoid.problem import Array, Solution, Status
 from qpavoid.reason import Reason, ReasonKind
-from qpavoid.run.log import STATUSES, Log
+from qpavoid.run.log import STATUSES, WITH_PLANNING, Log
 from qpavoid.run.machine import versions
 from qpavoid.solvers.solver import NamedSolver
 
@@ -192,7 +192,7 @@ class Recorder:
         meta = {
             "scenario": self._scenario.source.stem,
             "title": self._scenario.title,
-            "solver": self._controller.solver.label,
+            "solver": self._controller.solver.label + f" {WITH_PLANNING}" * bool(self._scenario.planning),
             "config": self._scenario.model_dump(mode="json", exclude=None if is_named else {"solver"}),
             "source": self._scenario.source.name,
             "completed": stopped_by is None and self._count == len(self._arrays["t"]),

@@ -51,19 +51,18 @@ def solver_styles(logs: Sequence[Log]) -> list[dict[str, Any]]:
     of one law with two back ends, show both their lines.
     """
     solvers: list[str] = [log.meta["solver"] for log in logs]
-    names = [log.meta["solver"] + " with planning" * bool(log.meta["config"].get("planning")) for log in logs]
     chosen = [SOLVER_STYLES.get(solver) if solver not in solvers[:i] else None for i, solver in enumerate(solvers)]
     used: list[tuple[str, Any]] = [style for style in chosen if style is not None]
     free = [(colour, dash) for dash in DASHES[::-1] for colour in COLOURS[::-1]]  # wide gaps first
     styles = []
-    for i, name in enumerate(names):
+    for i, name in enumerate(solvers):
         style = chosen[i]
         if style is None:
             colours, dashes = zip(*used, strict=True) if used else ((), ())
             style = min(free, key=lambda s: (s in used, colours.count(s[0]), dashes.count(s[1])))
             used.append(style)
         colour, dash = style
-        label = f"{name} ({names[:i].count(name)})" if name in names[:i] else name
+        label = f"{name} ({solvers[:i].count(name)})" if name in solvers[:i] else name
         styles.append({"label": label, "color": colour, "linestyle": dash, "zorder": 3.0 if dash == "-" else 3.5})
     return styles
 

@@ -61,7 +61,7 @@ def plot_run(log: Log, folder: str | Path, sight: Sight | None = None) -> list[P
     figures |= torque_figures(log)
     for figure in figures.values():
         figure.suptitle(_title(log), fontsize=11)
-    return _save(figures, folder, f"{log.meta['scenario']}_{log.meta['solver'].replace(':', '-')}")
+    return _save(figures, folder, log.stem)
 
 
 def plot_compare(logs: Sequence[Log], folder: str | Path) -> list[Path]:

@@ -68,7 +68,7 @@ def _section(logs: Sequence[Log], pictures: Sequence[str]) -> str:
     ]
     for log, run in zip(logs, metrics, strict=True):
         solver = str(log.meta["solver"])
-        stem = f"{name}_{solver.replace(':', '-')}"
+        stem = log.stem
         figures = "".join(
             _image(f"{stem}_{figure}.png", pictures)
             for figure in ("motion", "distances", "speeds", "joints", "torques", "contacts")
