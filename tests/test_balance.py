@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial import ConvexHull
 
+from qpavoid import load_scenario, simulate
 from qpavoid.kernels.balance_rows import balance_rows, convex_hull
 
 Step = namedtuple("Step", "v_prev")
@@ -38,6 +39,20 @@ def test_a_velocity_within_the_rows_keeps_the_capture_point_inside(factor):
         assert (rows @ velocity >= rhs).all() == (np.abs(capture) <= 0.08).all()
         inside += (np.abs(capture) <= 0.08).all()
     assert inside > 20
+
+
+@pytest.mark.slow
+def test_a_reach_beyond_the_feet_ends_before_it_tips_the_robot_over():
+    """A hand is drawn 0.75 m forward in MuJoCo, no task keeps the centre of mass: with rows, all steps are solved."""
+    pytest.importorskip("mujoco")
+    reach = "tasks.0.motion={type: line, end: [0.75, -0.2, 0.0], speed: 0.4, profile: smooth}"
+    fields = ["obstacles=[]", reach, "tasks.2.weight=0.001"]
+    log = simulate(load_scenario("g1_wave", [*fields, "duration=3", "dynamics.support_margin=0.01"]))
+    figures = log.metrics()
+    assert figures["status_counts"]["SOLVED"] == len(log.q)
+    assert figures["torque"]["slip"] < 5e-3 and abs(log.q[-1, 2] - log.q[0, 2]) < 0.02
+    without = simulate(load_scenario("g1_wave", [*fields, "duration=1.6"])).metrics()
+    assert without["status_counts"]["STOPPED"] > 0  # it tips over its toes
 
 
 def test_two_points_bear_no_balance():
