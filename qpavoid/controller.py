@@ -32,6 +32,7 @@ from qpavoid.model.scene import Obstacle, Scene
 from qpavoid.planning.replanning import Replanning
 from qpavoid.problem import Array, Solution, State, as_vector, require_finite
 from qpavoid.safety.arbiter import Arbiter
+from qpavoid.safety.closed_loop import ClosedLoops
 from qpavoid.solvers import Solver, as_solver, check_solver, make_solver
 from qpavoid.solvers.solver import NamedSolver
 
@@ -40,7 +41,7 @@ _MAX_DT = 1.0
 _WARM_UP = "a passing obstacle, to warm up"
 
 
-class Controller(SceneChanges, SplitStep):
+class Controller(SceneChanges, SplitStep, ClosedLoops):
     """Follows its tasks and keeps clear of everything in its scene."""
 
     def __init__(

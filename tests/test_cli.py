@@ -283,6 +283,7 @@ def test_signal_leaves_a_log_of_the_steps_before(cli, monkeypatch, signum):
         return tick(self, *args, **named)
 
     monkeypatch.setattr(Controller, "tick", counted)
+    monkeypatch.setattr(Controller, "closed_loop", lambda self: None)
     before = signal.signal(signal.SIGINT, signal.default_int_handler)  # a parent may have it ignored
     result = cli("run", "situation1", "--set", "duration=1000", "--no-figures", "--json")
     signal.signal(signal.SIGINT, before)

@@ -223,6 +223,11 @@ class RowAssembler(TrackedVelocities):
             self.query.compute(self._forward.joint_poses, self.influence_distance)
 
     @property
+    def settles(self) -> bool:
+        """Whether a step may settle its velocity, of a law that it knows."""
+        return bool(self._layout.looks_ahead and self._layout.regularization > 0.0)
+
+    @property
     def position_margin(self) -> float:
         """Distance to the nearest position limit in the last step [rad, m]; negative outside."""
         return float(self._layout.summary["position_margin"][0])

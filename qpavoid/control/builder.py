@@ -79,7 +79,9 @@ class ProblemBuilder:
         limits, strided = self._configurations.bounds, np.zeros(2 * model.nq)[::2]
         self._usual_arguments = limits, np.zeros(int(limits[2].max()) + 1), self.rows.targets, self.rows.q
         self._take_usual = kernels.direct(kernels.take_usual, strided, *self._usual_arguments)  # q: of any strides
-        self._has_plain_steps = self.rows.is_compiled and self.rows.dynamics is None and not settings.latency
+        self.usual_limits = self._usual_arguments[:2]
+        """Limits and scratch of `kernels.take_usual`."""
+        self.has_plain_steps = self.rows.is_compiled and self.rows.dynamics is None and not settings.latency
         self._thread: int | None = None
         self.begun: StepProblem | None = None
         """Step whose command is not known yet."""
@@ -142,7 +144,7 @@ class ProblemBuilder:
         Returns:
             None where it is another step, for which nothing has been changed.
         """
-        if not (self._has_plain_steps and self.begun is None and self._thread is None and _is_plain(q, self._q_shape)):
+        if not (self.has_plain_steps and self.begun is None and self._thread is None and _is_plain(q, self._q_shape)):
             return None
         if v is not None and not (_is_plain(v, self._v_shape) and hypot(*v.tolist()) <= LARGEST_VELOCITY):
             return None
@@ -166,6 +168,19 @@ class ProblemBuilder:
         step.is_settled = rows.run()
         step.is_plain = step.is_settled and not step.faults
         return self._finish(step)
+
+    def is_plain_ahead(self, t: float) -> bool:
+        """Return whether a step at t [s] would go on as expected, and all that it needs to know is there already."""
+        query, tracker = self.rows.query, self.tracker
+        is_expected = self.begun is None and self._thread is None and self._clock.usual(t) is not None
+        if not (is_expected and self.rows.settles and tracker.is_foreseen and not query.table.attached):
+            return False
+        turns_planes = bool(np.isinf(query.obstacle_radii[tracker.current.which]).any())
+        return not (turns_planes or self.attachments.is_watching)
+
+    def go_on(self, t: float) -> None:
+        """Take a step at t [s] as taken, of which kernels have done everything."""
+        self._clock.set(t)
 
     def _place(self, update: StepUpdate) -> Observation:
         """Take over an update of obstacles, and place them."""

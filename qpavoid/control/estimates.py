@@ -61,18 +61,19 @@ class MeasuredStates:
             max_position=FARTHEST,
             max_speed=FASTEST,
         )
-        self._packed = kernels.pack(self.arrays)
+        self.packed = kernels.pack(self.arrays)
+        """The same memory, in the form that kernels take."""
         self._follow: Callable[..., bool] | None = None
         self.known: dict[int, None] = {}
         """Numbers of the obstacles that are given, in the order in which they first were."""
         for columns in (STATE, POSE, QUATERNION):  # the same code
             rows = np.zeros((0, columns))
-            self._check = kernels.direct(kernels.check_updates, self._packed, _NONE, rows, _NONE)
-        self._observe = kernels.direct(kernels.observe, self._packed, 0.0, _NONE, _NONE, _NO_STAMPS, _NONE)
+            self._check = kernels.direct(kernels.check_updates, self.packed, _NONE, rows, _NONE)
+        self._observe = kernels.direct(kernels.observe, self.packed, 0.0, _NONE, _NONE, _NO_STAMPS, _NONE)
 
     def follow_trajectories(self, t: float, which: IntArray, distances: Any) -> bool:
         """Bring all obstacles to t [s], and place some (k,); see `kernels.follow_trajectories`."""
-        arguments = self._packed, distances, t, which
+        arguments = self.packed, distances, t, which
         if self._follow is None:
             self._follow = kernels.direct(kernels.follow_trajectories, *arguments)
         return bool(self._follow(*arguments))
@@ -80,7 +81,7 @@ class MeasuredStates:
     def follow(self, pieces: Pieces) -> None:
         """Let obstacles follow other trajectories."""
         self.arrays = self.arrays._replace(pieces=pieces)
-        self._packed = kernels.pack(self.arrays)
+        self.packed = kernels.pack(self.arrays)
 
     def forget(self, index: int) -> None:
         """Drop what is known of obstacle number `index`."""
@@ -103,7 +104,7 @@ class MeasuredStates:
             rows: (k, 18), (k, 12) or (k, 7), in one piece.
             kind: SAMPLE, POSE or REST (k,).
         """
-        return int(self._check(self._packed, which, rows, kind))
+        return int(self._check(self.packed, which, rows, kind))
 
     def observe(self, t: float, which: IntArray, kind: IntArray, stamps: Array, external: IntArray) -> tuple[int, int]:
         """Take over `updates` of some obstacles, and bring all to t [s]; see `kernels.observe`.
@@ -118,5 +119,5 @@ class MeasuredStates:
         Returns:
             How many updates were not taken over; how many obstacles are stale.
         """
-        counts: tuple[int, int] = self._observe(self._packed, t, which, kind, stamps, external)
+        counts: tuple[int, int] = self._observe(self.packed, t, which, kind, stamps, external)
         return counts

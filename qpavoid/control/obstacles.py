@@ -97,6 +97,16 @@ class ObstacleTracker:
         return self._trajectories.others
 
     @property
+    def is_foreseen(self) -> bool:
+        """Whether every obstacle rests, or is on a trajectory that kernels sample."""
+        return not (self._measured.known or self._awaited or self._trajectories.others)
+
+    @property
+    def packed(self) -> Any:
+        """Memory of the states, in the form that kernels take."""
+        return self._measured.packed
+
+    @property
     def prediction(self) -> Prediction:
         """What is known of the obstacles in the last step, as far as the future follows from it; nothing changes it."""
         if self._prediction is None:

@@ -13,6 +13,8 @@ from numba import config, njit
 from qpavoid.kernels.cache import KernelCache
 
 _F = TypeVar("_F", bound=Callable[..., Any])
+FASTMATH = {"reassoc", "contract", "nsz"}
+"""What the compiler may do with floating point in all kernels but those that are `exact`."""
 
 
 def released(function: _F) -> _F:
@@ -24,7 +26,16 @@ def released(function: _F) -> _F:
     return compiled(function, nogil=True)
 
 
-def compiled(function: _F, nogil: bool = False) -> _F:
+def exact(function: _F) -> _F:
+    """Compile a kernel whose sums are rounded in the order in which they stand, as numpy and Pinocchio round them.
+
+    Args:
+        function: see `compiled`.
+    """
+    return compiled(function, fastmath=set())
+
+
+def compiled(function: _F, nogil: bool = False, fastmath: set[str] = FASTMATH) -> _F:
     """Compile a kernel at its first call with arguments of some types, or load its code from disk.
 
     Sums may be taken in any order, so that they become vector instructions. NaN and infinities are preserved, but the
@@ -33,8 +44,9 @@ def compiled(function: _F, nogil: bool = False) -> _F:
     Args:
         function: the loops; every function that they call is compiled as well.
         nogil: whether other threads may run meanwhile.
+        fastmath: what the compiler may do with floating point.
     """
-    kernel = njit(fastmath={"reassoc", "contract", "nsz"}, nogil=nogil)(function)
+    kernel = njit(fastmath=fastmath, nogil=nogil)(function)
     if not config.DISABLE_JIT:
         kernel._cache = KernelCache(function)  # what `cache=True` does, with another place on disk
     return kernel
@@ -42,4 +54,4 @@ def compiled(function: _F, nogil: bool = False) -> _F:
 
 def inlined(function: _F) -> _F:
     """Compile a part of a kernel into each of its callers: for parts whose arguments cost as much as their work."""
-    return njit(fastmath={"reassoc", "contract", "nsz"}, forceinline=True)(function)
+    return njit(fastmath=FASTMATH, forceinline=True)(function)

@@ -6,7 +6,9 @@ from collections.abc import Callable
 from typing import Any, cast
 
 from numba import config, typeof, types
+from numba.core import cgutils
 from numba.experimental import structref
+from numba.extending import intrinsic
 
 from qpavoid.kernels.approach import ApproachArrays
 from qpavoid.kernels.dynamics import DynamicsArrays
@@ -224,3 +226,59 @@ def direct(kernel: Any, *arguments: Any) -> Callable[..., Any]:
         return cast(Callable[..., Any], kernel)
     code = kernel.overloads.get(tuple(typeof(argument) for argument in arguments))
     return cast(Callable[..., Any], getattr(code, "entry_point", kernel))
+
+
+def address(kernel: Any, *arguments: Any) -> Any:
+    """Return the address of a kernel's code for the types of some arguments, which it is not called with.
+
+    A loop of kernels calls them by their addresses, and so is compiled without compiling them into it once more, which
+    takes as long again as each of them did. With `NUMBA_DISABLE_JIT=1` an address is the kernel itself.
+    """
+    if config.DISABLE_JIT:
+        return kernel
+    kinds = tuple(typeof(argument) for argument in arguments)
+    kernel.compile(kinds)
+    code = kernel.overloads[kinds]
+    return code.library.get_pointer_to_function(code.fndesc.llvm_func_name)
+
+
+def _caller(result: Any) -> Callable[..., Any]:
+    """Return what calls, in compiled code, a kernel by its address with a tuple of arguments.
+
+    Types are not checked: the arguments have to be of the types that the address was asked for.
+
+    Args:
+        result: type of what the kernel returns.
+    """
+    if config.DISABLE_JIT:
+        return lambda kernel, arguments: kernel(*arguments)
+
+    @intrinsic
+    def call(_: Any, address: Any, arguments: Any) -> Any:
+        def write(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+            kinds = tuple(signature.args[1])
+            function = context.call_conv.get_function_type(signature.return_type, kinds)
+            code = builder.inttoptr(values[0], function.as_pointer())
+            given = cgutils.unpack_tuple(builder, values[1])
+            status, answer = context.call_conv.call_function(builder, code, signature.return_type, kinds, given)
+            with cgutils.if_unlikely(builder, status.is_error):
+                context.call_conv.return_status_propagate(builder, status)
+            return answer
+
+        return result(address, types.Tuple([types.unliteral(kind) for kind in arguments])), write
+
+    return cast(Callable[..., Any], call)
+
+
+call = _caller(types.none)
+"""Call a kernel that returns nothing: address, tuple of arguments."""
+call_for_code = _caller(types.intp)
+"""Call one that returns an integer."""
+call_for_counts = _caller(types.UniTuple(types.intp, 2))
+"""Call one that returns two integers."""
+call_for_three_counts = _caller(types.UniTuple(types.intp, 3))
+"""Call one that returns three integers."""
+call_for_placing = _caller(types.Tuple((types.intp, types.boolean)))
+"""Call one that returns an integer and a truth value, as `place_obstacles`."""
+call_for_nearness = _caller(types.Tuple((types.boolean, types.float64)))
+"""Call one that returns a truth value and a number, as `comes_near`."""

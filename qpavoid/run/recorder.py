@@ -7,23 +7,22 @@ from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import pinocchio as pin
 
 from qpavoid import kernels
 from qpavoid.config import Mesh, PointCloud, ScenarioConfig
-from qpavoid.control.obstacle_states import ObstacleStates
 from qpavoid.control.tasks import in_order
 from qpavoid.control.tick import Tick
 from qpavoid.controller import Controller
 from qpavoid.geometry.bodies import enclosing_capsule, surface_triangles
-from qpavoid.model.kinematics import ForwardKinematics
+from qpavoid.kernels.closed_loop import Periods
 from qpavoid.model.robot import Robot
-from qpavoid.model.sample import POSE, STATE
+from qpavoid.model.sample import POSE
 from qpavoid.model.scene import PARKING_DISTANCE, Obstacle, Scene
 from qpavoid.problem import Array, Solution, Status
 from qpavoid.reason import Reason, ReasonKind
 from qpavoid.run.log import STATUSES, WITH_PLANNING, Log
 from qpavoid.run.machine import versions
+from qpavoid.run.measurement import StateMeasurement
 from qpavoid.solvers.solver import NamedSolver
 
 if TYPE_CHECKING:
@@ -34,6 +33,9 @@ _MAX_EVENTS = 1000
 
 _CHUNK = 64
 """Steps whose poses and distances are kept until they are stored together: array functions cost as much for one."""
+
+_PLAIN = Solution.solved(np.zeros(0))
+"""Stands for solutions of which there is nothing to say."""
 
 
 class Recorder:
@@ -47,7 +49,7 @@ class Recorder:
         self._scene, self._scenario = scene, scenario
         self._frames, self._other_tasks = in_order(controller.tasks)
         self._controller, self._plant = controller, plant
-        self._kinematics, self._query = ForwardKinematics(model), controller.distances()  # of all pairs, near or not
+        self._measuring = StateMeasurement(controller, _CHUNK)  # of all pairs, near or not
         self._ends, self._radii = _drawing_axes(scene.robot)
         sizes = {"N": ticks, "nq": model.nq, "nv": model.nv, "k": len(self._frames), "s": len(self._other_tasks)}
         sizes |= {"m": len(plant.torque) if plant else 0, "c": len(plant.point_names) if plant else 0}
@@ -57,13 +59,10 @@ class Recorder:
         self._descriptions: list[dict[str, Any]] = []
         self._names, self._pairs = scene.pair_names, [list(pair) for pair in scene.pair_names]
         self._pair_numbers = np.append(np.arange(len(self._pairs)), -1)  # of the scene's pairs in that list; of none
-        count = len(scene.slots)
-        self._states, self._margin, self._numbers = np.zeros((count, STATE)), np.zeros(count), np.arange(count)
         self._moving = [i for i, obstacle in enumerate(scene.slots) if obstacle.moves]
-        self._bodies = np.arange(len(self._ends))
-        self._joints = np.array([body.parentJoint for body in scene.robot.bodies.geometryObjects], dtype=np.intp)
-        self._distance = np.full((_CHUNK, len(self._pairs) + 1), np.inf)
-        self._placed, self._posed = np.zeros((_CHUNK, count, POSE)), np.zeros((_CHUNK, len(self._joints), POSE))
+        self._bodies, frames = np.arange(len(self._ends)), len(self._frames)
+        self._turning = np.array([k for k, task in enumerate(self._frames) if task.turns], dtype=np.intp)
+        self._placed, self._target_rotation = self._measuring.states[..., :POSE], np.zeros((ticks, frames, 3, 3))
         self._count = self._flushed = 0
         self._notice_obstacles()
         self._count_pairs()
@@ -78,7 +77,7 @@ class Recorder:
         for k, (task, target) in enumerate(zip(self._frames, tick.targets, strict=False)):
             x["target"][i, k] = target.position if task.moves else x["tool"][i, k]
             if task.turns:
-                x["turn_error"][i, k] = np.linalg.norm(pin.log3(target.rotation @ tick.kinematics.rotation[k].T))
+                self._target_rotation[i, k] = target.rotation
         for name in ("command_scale", "saturation", "build_time", "solve_time"):
             x[name][i] = getattr(solution, name)
         x["stalled"][i], x["severity"][i] = bool(solution.stalled), solution.severity or 0
@@ -91,11 +90,54 @@ class Recorder:
         if self._plant is not None:
             x["torque"][i], x["contact_force"][i] = self._plant.torque, self._plant.forces()
             x["slip"][i] = self._plant.slip()
-        self._write_bodies(tick)
+        self._notice_changes()
+        n = self._count - self._flushed
+        self._measuring.q[n], self._placed[n] = state.q, tick.obstacles
+        for j in self._moving if self._scenario.latency else ():  # the step takes them to be where they are later
+            if self._scene.slots[j].name not in self._attached:
+                self._placed[n, j] = self._scene.slots[j].motion.sample(state.t).row[:POSE]
+        self._measuring.measure(n, n + 1)
         self._count += 1
-        if self._count - self._flushed == _CHUNK:
+        if n + 1 == _CHUNK:
             self._flush()
         self._record_events(state.t, solution)
+
+    def add_periods(self, periods: Periods, count: int, seconds: float, last: Solution | None) -> None:
+        """Store plain steps, whose velocities are solutions without anything to say of them.
+
+        Args:
+            periods: record of them.
+            count: their number.
+            seconds: time that they took [s].
+            last: solution of the last one, if there is more to say of it.
+        """
+        self._notice_changes()
+        x, first, measuring, done = self._arrays, self._count, self._measuring, 0
+        rows = slice(first, first + count)
+        for name in ("t", "q", "v", "alpha", "beta"):
+            x[name][rows] = getattr(periods, name)[:count]
+        poses = periods.poses[:count]
+        x["tool"][rows] = poses[..., 9:]
+        x["tool_rotation"][rows] = poses[..., :9].reshape(*poses.shape[:2], 3, 3).swapaxes(2, 3)
+        targets = periods.targets[:count, :, :POSE]
+        self._target_rotation[rows] = targets[..., :9].reshape(*targets.shape[:2], 3, 3).swapaxes(2, 3)
+        for k, task in enumerate(self._frames):
+            x["target"][rows, k] = targets[:, k, 9:] if task.moves else x["tool"][rows, k]
+        x["command_scale"][rows], x["build_time"][rows] = 1.0, seconds / count
+        while done < count:
+            n = self._count - self._flushed
+            part = min(count - done, _CHUNK - n)
+            measuring.q[n : n + part] = periods.q[done : done + part]
+            self._placed[n : n + part] = periods.obstacles[done : done + part]
+            measuring.measure(n, n + part)
+            self._count, done = self._count + part, done + part
+            if n + part == _CHUNK:
+                self._flush()
+        if count > 1 or last is None:
+            self._record_events(float(x["t"][first]), _PLAIN)
+        if last is not None:
+            x["stalled"][self._count - 1], x["severity"][self._count - 1] = bool(last.stalled), last.severity or 0
+            self._record_events(float(x["t"][self._count - 1]), last)
 
     def _record_events(self, t: float, solution: Solution) -> None:
         """Store status and reasons where they differ from the previous ones in kind."""
@@ -140,30 +182,18 @@ class Recorder:
             row[: len(pairs)] = pairs
         self._attached = attached
 
-    def _write_bodies(self, tick: Tick) -> None:
-        """Keep poses of bodies and obstacles, and the distances of all pairs, for `_flush`."""
-        scene, n = self._scene, self._count - self._flushed
-        if scene.pair_names is not self._names or self._controller.attached != self._attached:
+    def _notice_changes(self) -> None:
+        """Take in what was added to the scene, removed, attached or released since the last step."""
+        if self._scene.pair_names is not self._names or self._controller.attached != self._attached:
             self._flush()
             self._notice_obstacles()
             self._count_pairs()
-            n = 0
-        self._kinematics.compute(tick.state.q)
-        states = self._states
-        states[:, :12] = tick.obstacles
-        for i in self._moving if self._scenario.latency else ():  # the step takes them to be where they are later
-            if scene.slots[i].name not in self._attached:
-                states[i, :12] = scene.slots[i].motion.sample(tick.state.t).row[:12]
-        self._query.place(ObstacleStates(self._numbers, states, self._margin, {}))
-        self._query.compute(self._kinematics.joint_poses, np.inf)
-        pairs = self._query.pairs
-        self._distance[n, pairs] = self._query.arrays.results[pairs, 0]
-        self._placed[n], self._posed[n] = states[:, :12], self._kinematics.joint_poses[self._joints]
 
     def _flush(self) -> None:
         """Store what is kept of the last steps: distances, and poses, NaN of obstacles that are not there."""
         x, first, count, numbers = self._arrays, self._flushed, self._count - self._flushed, self._pair_numbers
-        rows, distance, placed, posed = slice(first, first + count), self._distance, self._placed, self._posed[:count]
+        rows, placed = slice(first, first + count), self._placed
+        distance, posed = self._measuring.distance, self._measuring.posed[:count]
         x["obstacle_position"][rows, self._columns] = placed[:count, self._present, 9:]
         rotations = placed[:count, self._present, :9].reshape(count, -1, 3, 3)
         x["obstacle_rotation"][rows, self._columns] = rotations.transpose(0, 1, 3, 2)
@@ -187,6 +217,8 @@ class Recorder:
             stopped_by: why the run ended before its time, if it did.
         """
         self._flush()
+        x, turning = self._arrays, self._turning
+        x["turn_error"][:, turning] = _angles(self._target_rotation[:, turning], x["tool_rotation"][:, turning])
         scene, robot, plant = self._scene, self._scene.robot, self._plant
         bounds, is_named = robot.bounds(), isinstance(self._controller.solver, NamedSolver)
         meta = {
@@ -220,6 +252,13 @@ class Recorder:
         }
         arrays = {name: array[: self._count].copy() for name, array in self._arrays.items()}
         return Log(**arrays, meta=meta)
+
+
+def _angles(rotation: Array, other: Array) -> Array:
+    """Return the angles (N, k) between rotations (N, k, 3, 3) [rad]."""
+    between = rotation @ other.swapaxes(2, 3)
+    axis = np.stack([between[..., i, j] - between[..., j, i] for i, j in ((2, 1), (0, 2), (1, 0))], axis=-1)
+    return np.asarray(np.arctan2(np.linalg.norm(axis, axis=-1), np.trace(between, axis1=2, axis2=3) - 1.0))
 
 
 def _attachment_body(scene: Scene, joint: int) -> int:

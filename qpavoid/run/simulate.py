@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Sequence
+from time import perf_counter
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
@@ -18,11 +19,14 @@ from qpavoid.errors import ConfigError, NumericalError
 from qpavoid.model.robot import Robot
 from qpavoid.problem import Array, State
 from qpavoid.run.log import Log
-from qpavoid.run.recorder import Recorder
 from qpavoid.solvers import Solver, parse_solver
 
 if TYPE_CHECKING:
     from qpavoid.run.torque_plant import TorquePlant
+
+
+_SHOWN = 10
+"""Ticks that compiled code runs in one go at most, where somebody follows the progress [-]."""
 
 
 class StartWarning(UserWarning):
@@ -43,7 +47,8 @@ def simulate(
     Args:
         scenario: configuration, shipped name or path.
         solver: replaces the scenario's solver, as in `eq10` or `qp:proxqp`; or a `Solver` of your own.
-        progress: called after each tick with the number done and the number in all.
+        progress: called with the number of ticks done and the number in all: after each, or after ten at most that
+            compiled code runs in one go.
         plant: robot with torque motors in MuJoCo, `mujoco` for one that is as its model; it needs a scenario with a
             `dynamics` block. That of the scenario, if any, where it is left out. The log then has torques, and where
             contacts touch a floor, their forces and slip.
@@ -70,6 +75,8 @@ def run(
     law: Solver | None = None,
 ) -> Log:
     """Run a scenario, see `simulate`, with its robot if that is loaded already, and by another law than its own."""
+    from qpavoid.run.recorder import Recorder  # with all that measures for it: a loop of your own needs none
+
     controller, q = Controller.from_scenario(scenario, robot)
     if law is not None:
         controller.solver = law
@@ -85,17 +92,25 @@ def run(
         raise ConfigError(
             f"{scenario.source}: duration: {ticks} ticks do not fit into memory; shorten it, or lengthen dt"
         ) from None
-    stopped_by = None
+    stopped_by, k = None, 0
+    loop = controller.closed_loop() if motors is None else None
     try:
-        for k in range(ticks):
-            if motors is not None:
+        while k < ticks:
+            begin = perf_counter()
+            most = ticks - k if progress is None else min(ticks - k, _SHOWN)
+            count = 0 if loop is None else loop.run(follower.q, k, most)
+            if loop is not None and count > 0:
+                recorder.add_periods(loop.periods, count, perf_counter() - begin, loop.last)
+                follower.go_on(loop.periods.q[count].copy(), loop.periods.v[count - 1].copy())
+            elif motors is not None:
                 recorder.add(_play(controller, motors, k * dt))
             else:
                 tick = controller.tick(follower.q, k * dt, v=follower.v, copy=False)
                 recorder.add(tick)
                 follower.follow(tick.solution.v)
+            k += max(count, 1)
             if progress is not None:
-                progress(k + 1, ticks)
+                progress(k, ticks)
     except KeyboardInterrupt:
         stopped_by = "interrupted from the keyboard"
     except NumericalError as error:
@@ -135,6 +150,11 @@ class Follower:
         self._under_way = CommandsUnderWay(model.nv, latency, dt) if latency else None
         self.q, self.v = q, np.zeros(model.nv)
         """Configuration (nq,) and velocity (nv,), as measured."""
+
+    def go_on(self, q: Array, v: Array) -> None:
+        """Be at q (nq,), where commands without a latency have led to, the last of which was v (nv,)."""
+        self.q = self._q_commanded = q
+        self.v = v
 
     def follow(self, v: Array) -> None:
         """Hold a commanded velocity (nv,) for one control period."""

@@ -48,15 +48,15 @@ class ApproachCheck:
             lever_arm=lever_arm,
             dt=settings.dt,
         )
-        self._packed = kernels.pack(self._memory)
+        self.packed = kernels.pack(self._memory)
         self.max_speed = 0.0
         """Largest speed of any point of an obstacle, at the last call [m/s]."""
         self.reset()
         if count:
-            kernels.write_path_point(self._packed, 0, 0, now.states[0])
+            kernels.write_path_point(self.packed, 0, 0, now.states[0])
         self._v = np.zeros(settings.scene.robot.model.nv)
         self._comes_near = kernels.direct(
-            kernels.comes_near, self._packed, self._distances, self._v, obstacles.external, obstacles.on_trajectories
+            kernels.comes_near, self.packed, self._distances, self._v, obstacles.external, obstacles.on_trajectories
         )
         self.is_far(self._v, 0.0)  # compiled before any step
         self.reset()
@@ -83,7 +83,7 @@ class ApproachCheck:
             self._extend(first)
         self._v[:] = v  # the code takes v as it is: in one piece
         near, self.max_speed = self._comes_near(
-            self._packed, self._distances, self._v, obstacles.external, obstacles.on_trajectories
+            self.packed, self._distances, self._v, obstacles.external, obstacles.on_trajectories
         )
         return not near
 
@@ -94,8 +94,8 @@ class ApproachCheck:
         missing = [s for s in range(first, first + PATH_POINTS) if x.numbers[s % PATH_POINTS] != s]
         for index, motion in obstacles.custom_trajectories.items():
             for s in missing:
-                kernels.write_path_point(self._packed, s % PATH_POINTS, index, motion.sample(s * PATH_PERIOD).row)
-        kernels.extend_paths(self._packed, obstacles.prediction.pieces, obstacles.on_trajectories, first)
+                kernels.write_path_point(self.packed, s % PATH_POINTS, index, motion.sample(s * PATH_PERIOD).row)
+        kernels.extend_paths(self.packed, obstacles.prediction.pieces, obstacles.on_trajectories, first)
 
 
 class SettledSteps:

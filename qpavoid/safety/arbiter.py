@@ -36,7 +36,8 @@ class Arbiter:
         self, settings: ControlSettings, solver: Solver, rows: RowAssembler, obstacles: ObstacleTracker
     ) -> None:
         """Build the checks, each with memory of its own."""
-        self._settings, self.solver, self._rows, self._obstacles = settings, solver, rows, obstacles
+        self._settings = self.settings = settings
+        self.solver, self._rows, self._obstacles = solver, rows, obstacles
         self._reports_limits = rows.previous.needs_report
         self._v_shape = (settings.scene.robot.model.nv,)
         self._braking = BrakingCheck(settings, rows, obstacles)
@@ -96,14 +97,30 @@ class Arbiter:
             except BudgetSpent as error:
                 solution = _stop(problem, (Reason.of(ReasonKind.BUDGET_SPENT, str(error)),))
         if from_tasks:
-            stalled = self.progress.update(problem, solution)
-            if stalled or not damping.is_idle:
-                damping.update(solution.v, rows.proximity().feedforward, bool(stalled))
-            solution = solution._replace(stalled=stalled) if stalled else solution
+            solution = self.monitor(problem, solution)
         backup = self.backup
         if backup is not None and self.solver.bounded and (backup.is_active or len(self._obstacles.moving)):
             solution = self._ensure_backup(backup, q, t, solution)
         return self._report_limits(solution) if self._reports_limits else solution
+
+    @property
+    def is_plain_ahead(self) -> bool:
+        """Whether settled steps of the tasks will be commanded as they are while no obstacle comes near."""
+        damping, backup = self._shake_damping, self.backup
+        is_calm = not self._reports_limits and damping.factor == 1.0 and damping.is_idle
+        return is_calm and not self.progress.is_stalled and (backup is None or backup.is_idle)
+
+    def monitor(self, problem: Problem | None, solution: Solution) -> Solution:
+        """Take in what is commanded in a step of the tasks; return the solution with why they are stalled, if they are.
+
+        Args:
+            problem: of the tasks; None for that of the last step.
+            solution: what is commanded.
+        """
+        damping, stalled = self._shake_damping, self.progress.update(problem, solution)
+        if stalled or not damping.is_idle:
+            damping.update(solution.v, self._rows.proximity().feedforward, bool(stalled))
+        return solution._replace(stalled=stalled) if stalled else solution
 
     def stop(self, reasons: tuple[Reason, ...]) -> Solution:
         """Return the stop of this control step, with its reasons."""

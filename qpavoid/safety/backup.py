@@ -69,7 +69,7 @@ class BackupPlanner:
         self._model, self._obstacles, self._dt = settings.scene.robot.model, obstacles, settings.dt
         self._rollouts = BackupRollouts(settings, rows.query.table, obstacles)
         self._settled = SettledSteps(self._rollouts, rows)
-        self._approach = ApproachCheck(settings, rows.query, self._rollouts.lever_arm, obstacles)
+        self.approach = ApproachCheck(settings, rows.query, self._rollouts.lever_arm, obstacles)
         self._policies = BackupPolicies(settings.scene.robot.model.nv)
         self._poses = max(_FEWEST_POSES, round((_PERIOD_FRACTION * settings.dt - _SEARCH_TIME) / _POSE_TIME))
         """Poses of candidates that are evaluated in a control step: 114 at 100 Hz, 17 at 500 Hz."""
@@ -86,13 +86,13 @@ class BackupPlanner:
     def reset(self) -> None:
         """Drop the backup trajectory, and restart the random sequence."""
         self._policies.restart()
-        self._approach.reset()
+        self.approach.reset()
         self._forget()
 
     def brake_with(self, acceleration: Array) -> None:
         """Take accelerations (nv,) as those on which braking counts from now on [rad/s² or m/s²]."""
         self._rollouts.brake_with(acceleration)
-        self._approach.brake_with(acceleration)
+        self.approach.brake_with(acceleration)
 
     def _forget(self) -> None:
         """Drop the kept trajectory and the candidate."""
@@ -118,18 +118,20 @@ class BackupPlanner:
         """Whether there is a backup trajectory or a candidate: while nothing moves, `check` would only drop it."""
         return self._backup is not None or self._kind >= 0
 
+    @property
+    def is_idle(self) -> bool:
+        """Whether nothing that moves was near in the control step before, and the same obstacles move."""
+        return not self.is_active and self._moving is self._obstacles.moving
+
     def allows(self, v: Array, t: float) -> bool:
         """Return whether v (nv,), that of a settled step at t [s], may be commanded with nothing to search for.
 
-        So it is where nothing that moves is near, nor was, and `check` would change nothing; and where the kept
-        trajectory stays valid: that counts as a control step.
+        So it is where nothing that moves is near, nor was; and where the kept trajectory stays valid: a step is counted.
         """
-        if self._moving is not self._obstacles.moving:
-            return False
-        if not self.is_active:
-            return not len(self._moving) or self._approach.is_far(v, t)
-        backup, steps = self._backup, self._behind + 1
-        if backup is None or self._kind >= 0 or self._lasting_steps == 0 or len(self._obstacles.external):
+        if self.is_idle:
+            return not len(self._moving) or self.approach.is_far(v, t)
+        backup, steps, same = self._backup, self._behind + 1, self._moving is self._obstacles.moving
+        if backup is None or self._kind >= 0 or not (same and self._lasting_steps) or len(self._obstacles.external):
             return False
         if not self._settled.leaves_valid(backup, steps, t):
             return False
@@ -159,7 +161,7 @@ class BackupPlanner:
         self._catch_up()
         is_same_scene = self._moving is self._obstacles.moving
         lasts = self._lasting_steps > 0 and not len(self._obstacles.external)  # as `allows` takes it
-        is_near = len(self._obstacles.moving) > 0 and (lasts or not self._approach.is_far(v, t))
+        is_near = len(self._obstacles.moving) > 0 and (lasts or not self.approach.is_far(v, t))
         if not (is_near and is_same_scene):
             self._forget()
         if not is_near:
@@ -196,7 +198,7 @@ class BackupPlanner:
 
     def _is_valid(self, trajectory: BackupTrajectory | None, start: Start) -> bool:
         """Return whether a trajectory is certainly sufficient from a start close to its own."""
-        return trajectory is not None and self._rollouts.is_valid_from(trajectory, start, self._approach.max_speed)
+        return trajectory is not None and self._rollouts.is_valid_from(trajectory, start, self.approach.max_speed)
 
     def _may_wait(self, backup: BackupTrajectory) -> bool:
         """Return whether the search has just begun, and the best trajectory so far leads to no contact soon."""

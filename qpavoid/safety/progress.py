@@ -73,6 +73,20 @@ class ProgressMonitor:
         self._rows.curvature(np.zeros_like(self._rows.frame_errors))
 
     @property
+    def is_stalled(self) -> bool:
+        """Whether any task was stalled at the last check."""
+        return len(self._stalled) > 0
+
+    @property
+    def steps_to_check(self) -> int:
+        """Steps until the next check, that one included."""
+        return self._interval - self._step % self._interval
+
+    def count(self, steps: int) -> None:
+        """Count steps in which there was nothing to check."""
+        self._step += steps
+
+    @property
     def is_quiet(self) -> bool:
         """Whether there is nothing to check nor to say in the next step."""
         return not self._stalled and (self._step + 1) % self._interval != 0
