@@ -126,7 +126,7 @@ class BackupPlanner:
     def allows(self, v: Array, t: float) -> bool:
         """Return whether v (nv,), that of a settled step at t [s], may be commanded with nothing to search for.
 
-        So it is where nothing that moves is near, nor was; and where the kept trajectory stays valid: a step is counted.
+        So it is where nothing that moves is near, nor was; and where the kept trajectory stays valid: that counts.
         """
         if self.is_idle:
             return not len(self._moving) or self.approach.is_far(v, t)

@@ -21,6 +21,7 @@ from qpavoid_bench.adapters import adapters
 from qpavoid_bench.camera import camera
 from qpavoid_bench.endurance.command import endurance
 from qpavoid_bench.grasps.command import grasps
+from qpavoid_bench.loops import loops
 from qpavoid_bench.planning import planning
 from qpavoid_bench.serve import serve
 from qpavoid_bench.solvers.command import solvers
@@ -53,8 +54,9 @@ app.command()(adapters)
 app.command()(grasps)
 app.command()(dynamics)
 app.command()(planning)
+app.command()(loops)
 _MEASURES = (
-    "tick", "solvers", "endurance", "robots", "grasps", "serve", "camera", "adapters", "dynamics", "planning",
+    "tick", "solvers", "endurance", "robots", "grasps", "serve", "camera", "adapters", "dynamics", "planning", "loops",
 )  # fmt: skip
 """Commands that need none of the packages below."""
 
