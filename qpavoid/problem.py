@@ -255,6 +255,8 @@ class Solution(NamedTuple):
     """Largest change of the solver's raw velocity by the limits [rad/s or m/s]; 0 of a `bounded` solver."""
     plan: str = ""
     """Plan that is followed in place of the tasks alone, and why, in a sentence; empty without one."""
+    forecast: Array | None = None
+    """(n, nq) configurations to which the tasks alone were expected to lead, from when it was decided; else None."""
     forces: dict[str, Array] | None = None
     """Force (k, 3) of the ground on each corner of a contact, by its frame, world [N]; None without such."""
     external: Array | None = None

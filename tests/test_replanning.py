@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 from closed_loop import Awaited
 
-from qpavoid import Controller, Obstacle, Points, Sample, build_scene, build_tasks
+from qpavoid import Controller, Obstacle, Points, Sample, build_scene, build_tasks, simulate
 from qpavoid.config import Box, Capsule, Planning, PointCloud, Sphere, Task
 from qpavoid.planning import worker
+from qpavoid.viz.compare import path_figure, solver_styles
 from qpavoid_bench.arena.entrants import ENTRANTS
 from qpavoid_bench.arena.families import load_family, make_case
 from qpavoid_bench.arena.rollout import roll_out
@@ -46,6 +47,24 @@ def test_where_the_law_arrives_commands_are_those_of_the_law(family, seed):
     """Bit for bit, with hulls, whose distances start from those of the step before, too."""
     case = make_case(load_family(family), seed)
     assert roll(case).v.tobytes() == roll(case, "qp").v.tobytes()
+
+
+def test_logs_and_figures_have_the_forecast_that_a_plan_avoids():
+    """It is where the law alone ends; the views of the figure show all of both runs."""
+    law = make_case(load_family("shelf"), 1).scenario
+    logs = [simulate(law), simulate(law.model_copy(update={"planning": Planning(settle=3.0)}))]
+    (forecast,), alone, planned = logs[1].meta["forecasts"], logs[0].tool, logs[1].tool
+    assert forecast["t"] == logs[1].t[logs[1].planned][0]
+    paths = np.array(forecast["tools"])
+    np.testing.assert_allclose(paths[:, -1], alone[-1], atol=1e-3)
+    assert np.linalg.norm(alone[-1] - logs[1].target[-1]) > 0.1
+    figure = path_figure(logs, solver_styles(logs))
+    figure.canvas.draw()
+    assert "forecast without the plan" in [line.get_label() for line in figure.axes[0].get_lines()]
+    for ax in figure.axes:
+        vertical, (low, high) = "xyz".index(ax.get_ylabel()[0]), ax.get_ylim()
+        assert low < min(alone[..., vertical].min(), planned[..., vertical].min())
+        assert high > max(alone[..., vertical].max(), planned[..., vertical].max())
 
 
 class Counted(worker.InlineWorker):

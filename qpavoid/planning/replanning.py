@@ -94,6 +94,7 @@ class Replanning:
         self._driver.begin(TRACK)
         self._pending: Decision | None = None
         self._expected: Expected | None = None
+        self._rejected: Array | None = None  # configurations of the forecast that led to what is followed, or pending
         self._question: Question | None = None
         self._asked_states = _NO_STATES  # of obstacles that a program gives, in the last look
         self._asked_clouds = dict[int, Voxels]()  # what was in clouds then
@@ -164,7 +165,8 @@ class Replanning:
             self._pending = None
         notes = self._notes if self._no_plan is None else (self._no_plan,)
         if drive.reason or notes:
-            return solution._replace(plan=drive.reason, assumptions=(*solution.assumptions, *notes))
+            forecast = self._rejected if drive.reason else None
+            return solution._replace(plan=drive.reason, forecast=forecast, assumptions=(*solution.assumptions, *notes))
         return solution
 
     def _is_due(self, step: StepProblem) -> bool:
@@ -268,7 +270,7 @@ class Replanning:
         else:
             self._next_look, self._wait = t + period, period
             if outcome.decision.t >= t - _ROUND_OFF:  # else it comes too late
-                self._pending = outcome.decision
+                self._pending, self._rejected = outcome.decision, outcome.expected.q
 
     def _given_targets(self, step: StepProblem) -> dict[str, Any]:
         """Return targets that are not those of the tasks' motions, by name."""

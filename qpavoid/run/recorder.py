@@ -15,6 +15,7 @@ from qpavoid.control.tick import Tick
 from qpavoid.controller import Controller
 from qpavoid.geometry.bodies import enclosing_capsule, surface_triangles
 from qpavoid.kernels.closed_loop import Periods
+from qpavoid.model.kinematics import ForwardKinematics
 from qpavoid.model.robot import Robot
 from qpavoid.model.sample import POSE
 from qpavoid.model.scene import PARKING_DISTANCE, Obstacle, Scene
@@ -31,6 +32,8 @@ if TYPE_CHECKING:
 _MAX_EVENTS = 1000
 """Number of events that a log keeps: a run that changes its reasons at every step would fill memory."""
 
+_MAX_POINTS = 60
+"""Points of the path of a tool in a forecast that a log keeps: a figure shows no more."""
 _CHUNK = 64
 """Steps whose poses and distances are kept until they are stored together: array functions cost as much for one."""
 
@@ -67,6 +70,8 @@ class Recorder:
         self._notice_obstacles()
         self._count_pairs()
         self._events: list[list[Any]] = []
+        self._forecasts: list[dict[str, Any]] = []
+        self._forecast: Array | None = None  # the last of them
         self._keys: tuple[object, ...] = ()
 
     def add(self, tick: Tick) -> None:
@@ -101,6 +106,9 @@ class Recorder:
         if n + 1 == _CHUNK:
             self._flush()
         self._record_events(state.t, solution)
+        if solution.forecast is not None and solution.forecast is not self._forecast:
+            self._forecast = solution.forecast
+            self._forecasts.append({"t": state.t, "tools": self._tool_paths(solution.forecast)})
 
     def add_periods(self, periods: Periods, count: int, seconds: float, last: Solution | None) -> None:
         """Store plain steps, whose velocities are solutions without anything to say of them.
@@ -149,6 +157,15 @@ class Recorder:
         if keys != self._keys and eventful and len(self._events) < _MAX_EVENTS:
             self._events.append([t, solution.status.value, [reason.as_dict() for reason in reasons]])
         self._keys = keys
+
+    def _tool_paths(self, q: Array) -> list[list[list[float]]]:
+        """Return the points of each tracked frame along configurations (n, nq), of some of them and the last [m]."""
+        ids = [task.frame_id for task in self._frames]
+        kinematics, points = ForwardKinematics(self._scene.robot.model, ids), []
+        for i in np.unique(np.linspace(0, len(q) - 1, _MAX_POINTS).round().astype(int)):
+            kinematics.compute(q[i])
+            points.append(kinematics.frame_poses[ids, 9:].round(5))
+        return np.array(points).swapaxes(0, 1).tolist()  # type: ignore[no-any-return]
 
     def _notice_obstacles(self) -> None:
         """Lay out columns for obstacles that are new, and number pairs with other names anew."""
@@ -230,6 +247,7 @@ class Recorder:
             "completed": stopped_by is None and self._count == len(self._arrays["t"]),
             "stopped_by": stopped_by,
             "events": self._events,
+            "forecasts": self._forecasts,
             "robot": robot.name,
             "notes": [str(note) for note in robot.notes],
             "positions": robot.position_names,

@@ -29,6 +29,8 @@ from qpavoid.viz.style import (
 )
 from qpavoid.viz.surfaces import capsule_faces, is_endless, moving_bodies, obstacle_faces, obstacle_path
 
+_VIEW_ASPECT = 1.9
+"""Width of a view of paths, by its height, beside the longest legend at least [-]."""
 SOLVER_STYLES: dict[str, tuple[str, Any]] = {
     "tracking": ("#333333", DASHES[2]),
     "eq10-literal": ("#E69F00", DASHES[3]),
@@ -120,10 +122,13 @@ def path_figure(logs: Sequence[Log], styles: Sequence[dict[str, Any]]) -> Figure
                 ax.plot(x, y, linewidth=1.7, **style)
                 for steps in spans(log.planned):
                     _mark_plan(ax, x, y, *steps, log.t)
+                for forecast in log.meta.get("forecasts", ()):
+                    _draw_forecast(ax, np.array(forecast["tools"][k])[:, [horizontal, vertical]])
         ax.autoscale_view()
         add_grid(ax)
         ax.set_aspect("equal", adjustable="datalim")
         ax.set_ylabel(f"{'xyz'[vertical]} [m]")
+    _widen(axes)
     axes[1].set_xlabel(f"{'xyz'[horizontal]} [m]")
     named = [line for line in axes[0].get_lines() if not str(line.get_label()).startswith("_")]
     handles: dict[str, Any] = {str(line.get_label()): line for line in named}
@@ -169,3 +174,17 @@ def _outlines(log: Log) -> list[tuple[Array, Any, float]]:
         for rank, step in enumerate(steps):
             outlines.append((obstacle_faces(log, i, int(present[step])), _colour(i), 0.5 * (rank + 1) / len(steps)))
     return outlines
+
+
+def _draw_forecast(ax: Any, path: Array) -> None:
+    """Draw where the tasks alone were expected to bring a tool, points (n, 2), with a cross at the end."""
+    label = "forecast without the plan"
+    ax.plot(*path.T, color=PLAN, linewidth=1.2, linestyle=(0, (3, 2)), zorder=3, label=label)
+    ax.plot(*path[-1], color=PLAN, marker="x", markersize=8, zorder=5)
+
+
+def _widen(axes: Any) -> None:
+    """Make room at the sides, so that what is high fits into views of one scale, and is not cut off."""
+    (left, right), height = axes[0].get_xlim(), max(np.ptp(ax.get_ylim()) for ax in axes)
+    missing = max(_VIEW_ASPECT * height - (right - left), 0.0)
+    axes[0].set_xlim(left - 0.5 * missing, right + 0.5 * missing)
