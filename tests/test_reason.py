@@ -125,7 +125,7 @@ def test_relaxed_row_far_from_safety_distance_informs(tmp_path):
 def test_noise_at_twice_the_safety_distance_informs(tmp_path, given, sigma, seed):
     """A ball at rest beside a tool that moves past it, seen at 100 Hz with an error of up to 1 mm and 50 mm/s.
 
-    In the first steps, the first backup trajectory may have to be followed while others are sought: in one of eight runs.
+    In the first steps, the first backup trajectory may be followed while others are sought: in one of eight runs.
     """
     rng = np.random.default_rng(seed)
     controller = make_controller(
