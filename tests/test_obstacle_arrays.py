@@ -151,9 +151,10 @@ def test_rows_follow_what_is_in_the_scene(panda):
 FIRST_USES = """
 import sys
 import numpy as np
-from qpavoid import Controller, Obstacle, Pose, Robot, Sample, build_scene, build_tasks
+from qpavoid import Controller, Obstacle, Pose, Robot, Sample, build_scene, build_tasks, load_scenario
 from qpavoid.config import Sphere, Task
 
+passing, q = Controller.from_scenario(load_scenario("panda_line"))
 robot = Robot.load("panda")
 scene = build_scene(robot, [Obstacle.at(f"o{i}", Sphere(radius=0.04), [1.5, 0.1 * i, 0.4]) for i in range(5)])
 controller = Controller(scene, build_tasks([Task(frame="panda_hand_tcp")], robot, robot.home))
@@ -163,7 +164,10 @@ def loaded():
     kernels = {id(f): f for module in modules for f in vars(module).values() if hasattr(f, "signatures")}
     return {f.__name__: len(f.signatures) for f in kernels.values()}
 
-before, sample = loaded(), Sample.at([1.0, 0.0, 0.5], linear=[-0.5, 0.0, 0.0])
+before = loaded()
+for k in range(5):
+    passing.step(q, 0.01 * k)
+sample = Sample.at([1.0, 0.0, 0.5], linear=[-0.5, 0.0, 0.0])
 poses = np.tile([1.0, 0.0, 0.5, 0.0, 0.0, 0.0, 1.0], (5, 1))
 for form in (
     {"o1": Pose.at([1.0, 0.0, 0.5])}, {"o1": sample}, {"o1": Sample.at([1.0, 0.0, 0.5], t=0.035)},

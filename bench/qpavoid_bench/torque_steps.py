@@ -24,7 +24,7 @@ _WARM_UP = 200
 """Steps before those that are timed [-]."""
 _EVERY = 20
 """Steps from one count of the pairs in range to the next."""
-_D2 = 0.09
+_D2 = 0.08
 """d2 of the humanoid [m]: so far that about 20 pairs are in range."""
 
 

@@ -67,6 +67,7 @@ class ProblemBuilder:
         self._q_last = self.rows.q.copy() if settings.latency else self.rows.q
         self._step = StepProblem(self.rows.q, 0.0, False, (), False, (), ())
         self.tracker = ObstacleTracker(scene.slots, settings.sensing, dt, settings.latency)
+        self.tracker.load(self.rows.query)
         self.attachments = Attachments(scene, self.rows.query, settings.safety_distance)
         self.slots = ObstacleSlots(scene, self.rows.query, self.tracker, self.attachments)
         self._clock, self._budget = Clock(dt), settings.budget

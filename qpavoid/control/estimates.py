@@ -63,7 +63,7 @@ class MeasuredStates:
         )
         self.packed = kernels.pack(self.arrays)
         """The same memory, in the form that kernels take."""
-        self._follow: Callable[..., bool] | None = None
+        self._follow: Callable[..., bool] = kernels.follow_trajectories
         self.known: dict[int, None] = {}
         """Numbers of the obstacles that are given, in the order in which they first were."""
         for columns in (STATE, POSE, QUATERNION):  # the same code
@@ -73,10 +73,11 @@ class MeasuredStates:
 
     def follow_trajectories(self, t: float, which: IntArray, distances: Any) -> bool:
         """Bring all obstacles to t [s], and place some (k,); see `kernels.follow_trajectories`."""
-        arguments = self.packed, distances, t, which
-        if self._follow is None:
-            self._follow = kernels.direct(kernels.follow_trajectories, *arguments)
-        return bool(self._follow(*arguments))
+        return bool(self._follow(self.packed, distances, t, which))
+
+    def load(self, distances: Any) -> None:
+        """Load the code of `follow_trajectories`: no control step waits for it."""
+        self._follow = kernels.direct(kernels.follow_trajectories, self.packed, distances, 0.0, _NONE)
 
     def follow(self, pieces: Pieces) -> None:
         """Let obstacles follow other trajectories."""

@@ -255,6 +255,10 @@ class ObstacleTracker:
         """Whether obstacles move, and all of them by trajectories that kernels sample."""
         return bool(self._moving) and not (self._measured.known or self._awaited or self._trajectories.others)
 
+    def load(self, query: DistanceQuery) -> None:
+        """Load the code of `follow`: no control step waits for it."""
+        self._measured.load(query.packed)
+
     def follow(self, t: float, query: DistanceQuery) -> None:
         """Bring obstacles that follow their trajectories to a step at t [s], and place them, in one compiled call."""
         self._now, self._prediction = t, None

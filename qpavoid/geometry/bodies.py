@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import Any
 
 import coal
@@ -70,7 +71,14 @@ def enclosing_capsule(geometry: Any) -> CapsuleFit:
         return CapsuleFit(np.zeros(3), np.eye(3), geometry.radius, 0.0)
     if isinstance(geometry, coal.Capsule):
         return CapsuleFit(np.zeros(3), np.eye(3), geometry.radius, 2.0 * geometry.halfLength)
-    return fit_capsule(hull_points(geometry))
+    points = np.ascontiguousarray(hull_points(geometry))
+    return _fit_once(points.tobytes(), len(points))
+
+
+@lru_cache(maxsize=256)
+def _fit_once(points: bytes, count: int) -> CapsuleFit:
+    """Return `fit_capsule` of points (count, 3): the hulls of a robot are the same whenever it is loaded."""
+    return fit_capsule(np.frombuffer(points).reshape(count, 3))
 
 
 def bounding_sphere(geometry: Any) -> tuple[Array, float]:
