@@ -253,7 +253,7 @@ class ObstacleTracker:
     @property
     def follows_trajectories(self) -> bool:
         """Whether obstacles move, and all of them by trajectories that kernels sample."""
-        return bool(self._moving) and not (self._measured.known or self._awaited or self._trajectories.others)
+        return bool(self._moving) and self.is_foreseen
 
     def load(self, query: DistanceQuery) -> None:
         """Load the code of `follow`: no control step waits for it."""

@@ -12,7 +12,7 @@ from qpavoid.kernels.obstacles import Pieces
 from qpavoid.kernels.packing import compiled, exact, released
 from qpavoid.kernels.rows import alpha, beta
 from qpavoid.kernels.step import SETTLED
-from qpavoid.kernels.structures import call, call_for_code, call_for_counts, call_for_nearness, call_for_placing
+from qpavoid.kernels.structures import call, call_for_code, call_for_nearness, call_for_truth
 from qpavoid.problem import Array, IntArray
 
 
@@ -20,8 +20,7 @@ class LoopCalls(NamedTuple):
     """Addresses of the kernels of a control step, see `kernels.structures`."""
 
     sample_pieces: Any
-    observe: Any
-    place_obstacles: Any
+    follow_trajectories: Any
     control_step: Any
     extend_paths: Any
     comes_near: Any
@@ -37,9 +36,7 @@ class LoopSetting(NamedTuple):
     squares: Array
     """Scratch of that."""
     none: IntArray
-    """(0,) obstacles that are updated, or given by a program."""
-    no_stamps: Array
-    """(0,) their time stamps."""
+    """(0,) obstacles that are given by a program."""
     placed: IntArray
     """Numbers of the obstacles that may have another state than at time 0."""
     on_paths: IntArray
@@ -117,12 +114,7 @@ def run_periods(
         if not take_usual(log.q[k], s.limits, s.squares, x.targets, q):
             return k
         if s.observes:
-            call_for_counts(calls.observe, (obstacles, t, s.none, s.none, s.no_stamps, s.none))
-            bad, moving = call_for_placing(
-                calls.place_obstacles, (x.distances, s.placed, obstacles.states, obstacles.margin)
-            )
-            if bad >= 0:
-                return k
+            moving = call_for_truth(calls.follow_trajectories, (obstacles, x.distances, t, s.placed))
         if call_for_code(calls.control_step, (x, q, s.influence_distance, moving, True, False)) != SETTLED:
             return k
         if s.watches:

@@ -274,8 +274,8 @@ call = _caller(types.none)
 """Call a kernel that returns nothing: address, tuple of arguments."""
 call_for_code = _caller(types.intp)
 """Call one that returns an integer."""
-call_for_counts = _caller(types.UniTuple(types.intp, 2))
-"""Call one that returns two integers."""
+call_for_truth = _caller(types.boolean)
+"""Call one that returns a truth value."""
 call_for_three_counts = _caller(types.UniTuple(types.intp, 3))
 """Call one that returns three integers."""
 call_for_placing = _caller(types.Tuple((types.intp, types.boolean)))

@@ -36,7 +36,7 @@ class Arbiter:
         self, settings: ControlSettings, solver: Solver, rows: RowAssembler, obstacles: ObstacleTracker
     ) -> None:
         """Build the checks, each with memory of its own."""
-        self._settings = self.settings = settings
+        self.settings = settings
         self.solver, self._rows, self._obstacles = solver, rows, obstacles
         self._reports_limits = rows.previous.needs_report
         self._v_shape = (settings.scene.robot.model.nv,)
@@ -64,12 +64,12 @@ class Arbiter:
 
     def accepts(self, t: float) -> bool:
         """Count a settled step of the tasks at t [s] if it is commanded as it is, else change nothing; see `decide`."""
-        damping, backup = self._shake_damping, self.backup
-        if self._reports_limits or damping.factor != 1.0 or not damping.is_idle or not self.progress.is_quiet:
+        backup = self.backup
+        if not (self._is_calm and self.progress.is_quiet):
             return False
         if backup is not None and not backup.allows(self._rows.v, t):
             return False
-        self.progress.skip()
+        self.progress.count(1)
         return True
 
     def decide(self, q: Array, t: float, is_settled: bool, from_tasks: bool) -> Solution:
@@ -90,8 +90,8 @@ class Arbiter:
                 problem = damping.apply(problem)
                 if problem.levels and self.solver.prioritised:
                     problem = rows.prioritised(problem)
-            if self._settings.budget.is_limited:
-                problem = problem._replace(budget=self._settings.budget)
+            if self.settings.budget.is_limited:
+                problem = problem._replace(budget=self.settings.budget)
             try:
                 solution = self._solve(q, problem, rows.proximity(), from_tasks)
             except BudgetSpent as error:
@@ -106,9 +106,13 @@ class Arbiter:
     @property
     def is_plain_ahead(self) -> bool:
         """Whether settled steps of the tasks will be commanded as they are while no obstacle comes near."""
-        damping, backup = self._shake_damping, self.backup
-        is_calm = not self._reports_limits and damping.factor == 1.0 and damping.is_idle
-        return is_calm and not self.progress.is_stalled and (backup is None or backup.is_idle)
+        return self._is_calm and not self.progress.is_stalled and (self.backup is None or self.backup.is_idle)
+
+    @property
+    def _is_calm(self) -> bool:
+        """Whether nothing but obstacles and progress can change or comment on a settled velocity."""
+        damping = self._shake_damping
+        return not self._reports_limits and damping.factor == 1.0 and damping.is_idle
 
     def monitor(self, problem: Problem | None, solution: Solution) -> Solution:
         """Take in what is commanded in a step of the tasks; return the solution with why they are stalled, if they are.
@@ -155,9 +159,9 @@ class Arbiter:
             if self._rows.dynamics is not None:
                 v = self._rows.dynamics.approach(v, self._rows.previous.v)
                 solution = solution._replace(v=v)
-            if not self._settings.limits.saturate:
+            if not self.settings.limits.saturate:
                 return solution
-            v, change = saturate(v, problem.lower, problem.upper, self._settings.bounds.velocity)
+            v, change = saturate(v, problem.lower, problem.upper, self.settings.bounds.velocity)
             return solution._replace(v=v, saturation=change)
         is_own = problem.violation <= 0.0 and v.tobytes() == problem.v_tracking.tobytes()
         if is_own and problem.tracking_is_clear:
@@ -165,12 +169,12 @@ class Arbiter:
         solution = solution if is_own else _clipped(problem, solution)
         limits = None if solution.status is Status.STOPPED else self._recovery_limits(problem, proximity)
         if limits is not None:
-            solution = slow_recovery(q, problem, solution, None if is_own else limits, self._settings.bounds)
-        return self._check_braking(q, problem, solution, limits) if self._settings.avoidance.look_ahead else solution
+            solution = slow_recovery(q, problem, solution, None if is_own else limits, self.settings.bounds)
+        return self._check_braking(q, problem, solution, limits) if self.settings.avoidance.look_ahead else solution
 
     def _recovery_limits(self, problem: Problem, proximity: Proximity) -> tuple[Array, Array] | None:
         """Return the bounds on a velocity in recovery, see `recovery_limits`."""
-        x = self._settings
+        x = self.settings
         return recovery_limits(problem, proximity.feedforward, x.bounds, self._rows.previous.v, x.dt)
 
     def _check_braking(
@@ -188,7 +192,7 @@ class Arbiter:
         v, scale, violation, pair, distance = result
         if violation <= TOLERANCE:
             return solution._replace(v=v, command_scale=scale * solution.command_scale)
-        names = self._settings.scene.pair_names[pair]
+        names = self.settings.scene.pair_names[pair]
         if violation != violation:  # NaN
             return _stop(problem, (*solution.reasons, Reason.of(ReasonKind.UNKNOWN_DISTANCE, *names)))
         severity = Severity.ALARM if distance < 0.0 else Severity.WARNING
@@ -199,7 +203,7 @@ class Arbiter:
         """Replace the velocity by that of the backup trajectory, where none would be left after it."""
         rows = self._rows
         if rows.dynamics is not None:
-            backup.brake_with(self._settings.bounds.acceleration)
+            backup.brake_with(self.settings.bounds.acceleration)
         try:
             v = backup.check(q, solution.v, t, rows.previous.v, rows.previous.dv, rows.proximity)
         except NumericalError as error:  # of a predicted state; raised by `step` once it is the present one

@@ -26,7 +26,7 @@ from qpavoid.safety.arbiter import Arbiter
 
 _CAPACITY = 256
 """Control periods in one call at most [-]."""
-_NONE, _NO_STAMPS = np.zeros(0, dtype=np.intp), np.zeros(0)
+_NONE = np.zeros(0, dtype=np.intp)
 
 
 class ClosedLoops:
@@ -69,11 +69,10 @@ class ClosedLoop:
         self.last: Solution | None = None
         """Solution of its last step, where there is more to say of it than its velocity."""
         self._watch = watch.packed
-        setting, now = self._setting(), tracker.current
+        setting = self._setting()
         self._calls = LoopCalls(
             sample_pieces=address(kernels.sample_pieces, setting.targets, 0.0, rows.targets),
-            observe=address(kernels.observe, tracker.packed, 0.0, _NONE, _NONE, _NO_STAMPS, _NONE),
-            place_obstacles=address(kernels.place_obstacles, rows.query.packed, _NONE, now.states, now.margin),
+            follow_trajectories=address(kernels.follow_trajectories, tracker.packed, rows.query.packed, 0.0, _NONE),
             control_step=address(
                 kernels.control_step, rows.packed, rows.q, setting.influence_distance, False, True, False
             ),
@@ -136,7 +135,6 @@ class ClosedLoop:
             limits=limits,
             squares=squares,
             none=_NONE,
-            no_stamps=_NO_STAMPS,
             placed=tracker.current.which,
             on_paths=tracker.on_trajectories,
             influence_distance=builder.rows.influence_distance,

@@ -89,11 +89,7 @@ class ProgressMonitor:
     @property
     def is_quiet(self) -> bool:
         """Whether there is nothing to check nor to say in the next step."""
-        return not self._stalled and (self._step + 1) % self._interval != 0
-
-    def skip(self) -> None:
-        """Count a step in which that is so."""
-        self._step += 1
+        return not self.is_stalled and self.steps_to_check > 1
 
     def update(self, problem: Problem | None, solution: Solution) -> tuple[Reason, ...]:
         """Return what keeps the tasks from their targets, after long enough without progress.
