@@ -34,7 +34,7 @@ from qpavoid.run.terminal import ERR, OUT, names_of, progress, terminate_like_in
 from qpavoid.service import commands as service_commands
 from qpavoid.setup import commands as robot_commands
 from qpavoid.solvers import SOLVERS, Solver, backend_names
-from qpavoid.solvers.python_file import names_file, solver_from_file
+from qpavoid.solvers.python_file import scenario_with_law
 from qpavoid.viz import commands as view_commands
 
 app = typer.Typer(
@@ -233,9 +233,7 @@ class _Job(NamedTuple):
 
 def _job(scenario: str, sets: list[str] | None, solver: str | None) -> _Job:
     """Read a scenario, with a solver by name or from a file."""
-    if solver is not None and names_file(solver):
-        return _Job(load_scenario(scenario, sets or ()), solver_from_file(solver))
-    return _Job(load_scenario(scenario, sets or (), solver), None)
+    return _Job(*scenario_with_law(scenario, sets or (), solver))
 
 
 def _run_all(jobs: list[_Job], out: Path) -> tuple[list[Log], list[Path]]:

@@ -162,7 +162,7 @@ def test_laws_of_a_file_run_and_are_compared(cli, tmp_path):
         ("laws.py:np", "laws.py:np: is no law"),
         ("laws.py:Needy", "laws.py:Needy: cannot be made without arguments"),
         ("other.py:Slow", "other.py: cannot be read"),
-        ("hpq", "--solver 'hpq': solver: unknown name 'hpq'; did you mean 'hqp'?"),
+        ("hpq", "solver 'hpq': solver: unknown name 'hpq'; did you mean 'hqp'?"),
     ):
         assert_refused(cli("run", "situation1", "--no-figures", "--solver", name), said)
 

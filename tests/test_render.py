@@ -84,6 +84,18 @@ def test_render_writes_film_and_picture(cli, tracking, tmp_path):
     assert np.abs(left.astype(int) - right.astype(int)).max(axis=2).mean() > 3.0  # tracking and qp do not do the same
 
 
+def test_render_takes_a_law_of_ones_own(cli, tmp_path):
+    (tmp_path / "laws.py").write_text("def same(problem):\n    return problem.v_tracking.copy()\n")
+    fields = [word for field in SHORT for word in ("--set", field)]
+    done = cli(
+        "render", "panda_ball", *fields, "--solvers", "tracking,laws.py:same", "--png", "moment.png", "--width", 320
+    )
+    assert done.status == 0, done.stderr
+    with Image.open(tmp_path / "moment.png") as moment:
+        picture = np.asarray(moment.convert("RGB")).astype(int)
+    assert np.abs(picture[20:, :160] - picture[20:, 160:]).max() < 5  # both track, and qp would do otherwise
+
+
 def test_render_of_a_log_needs_no_simulation(cli, tracking, tmp_path):
     done = cli("render", tracking, "--png", "moment.png", "--width", 160)
     assert done.status == 0, done.stderr

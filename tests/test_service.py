@@ -12,6 +12,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from qpavoid import ConfigError, Controller, Points, Pose, Sample, load_scenario
+from qpavoid.solvers.python_file import scenario_with_law
 
 msgpack, zmq = pytest.importorskip("msgpack"), pytest.importorskip("zmq")
 
@@ -66,8 +67,8 @@ def serve(scenario):
     """Begins a service in a thread; gives it, and clients of it."""
     running, clients = [], []
 
-    def begin(heartbeat=HEARTBEAT, served=scenario, motions=False):
-        service = Service(served, heartbeat, port=0, follows_motions=motions)
+    def begin(heartbeat=HEARTBEAT, served=scenario, motions=False, law=None):
+        service = Service(served, heartbeat, port=0, follows_motions=motions, law=law)
         thread = threading.Thread(target=service.run)
         thread.start()
         running.append((service, thread))
@@ -131,6 +132,21 @@ def test_answers_are_the_controllers_own(serve, scenario):
         assert [r["kind"] for r in theirs["assumptions"]] == [r.kind.value for r in mine.assumptions]
         q = pin.integrate(controller.scene.robot.model, q, DT * mine.v)
     assert np.abs(q - controller.scene.robot.home).max() > 0.01
+
+
+def test_a_law_of_ones_own_is_served(serve, tmp_path):
+    (tmp_path / "laws.py").write_text("def third(problem):\n    return problem.v_tracking / 3\n")
+    scenario, law = scenario_with_law("panda_line", (), f"{tmp_path / 'laws.py'}:third")
+    (ours, q), (theirs, _) = Controller.from_scenario(scenario), Controller.from_scenario(scenario)
+    ours.solver, theirs.solver = law, "tracking"
+    ask, frame = serve(served=scenario, law=law)[1](zmq.REQ).ask, scenario.tasks[0].frame
+    ask("reset")
+    target = ours.tick(q).kinematics.position[0] + [0.0, 0.0, 0.002]
+    ours.reset()
+    given = {frame: Sample.at(target)}
+    answer = ask("step", q=q.tolist(), t=0.0, targets={frame: {"position": target.tolist()}})
+    np.testing.assert_allclose(answer["v"], ours.step(q, 0.0, given).v, atol=1e-12)
+    np.testing.assert_allclose(answer["v"], theirs.step(q, 0.0, given).v / 3, atol=1e-9)
 
 
 def test_hello_says_what_a_client_has_to_know(serve):

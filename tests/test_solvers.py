@@ -250,5 +250,5 @@ def test_solver_is_given_as_in_a_file(panda):
                 make(block)
     with pytest.raises(ConfigError, match=r"^solver: NoneType is none; give a name"):
         make_solver(None)
-    with pytest.raises(ConfigError, match=r"^--solver 'hpq': solver: unknown name 'hpq'; did you mean 'hqp'\?$"):
+    with pytest.raises(ConfigError, match=r"^solver 'hpq': solver: unknown name 'hpq'; did you mean 'hqp'\?$"):
         load_scenario("situation1", solver="hpq")

@@ -45,7 +45,7 @@ def read_config(path: Path, model: type[Config], overrides: Sequence[str] = (), 
     """
     data = read_mapping(path)
     if solver is not None:
-        solver_fields(solver, f"--solver {solver!r}: ")
+        solver_fields(solver, f"solver {solver!r}: ")
         chosen_solver, settings = _solver_mapping(solver), _solver_mapping(data.get("solver"))
         data["solver"] = (
             {**settings, **chosen_solver} if settings.get("name") == chosen_solver["name"] else chosen_solver

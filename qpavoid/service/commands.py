@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from qpavoid.config.loading import load_scenario
 from qpavoid.errors import ConfigError
 from qpavoid.run.terminal import ERR, OUT
+from qpavoid.solvers.python_file import scenario_with_law
 
 if TYPE_CHECKING:
     from qpavoid.service.server import Service
@@ -22,7 +22,9 @@ _LOOPBACK = ("127.", "localhost", "[::1]")
 
 def serve(
     scenario: Annotated[str, typer.Argument(help="Shipped name or path of a YAML file.")],
-    solver: Annotated[str | None, typer.Option(help="Such as eq10 or qp:proxqp; as in the file if left out.")] = None,
+    solver: Annotated[
+        str | None, typer.Option(help="Such as eq10, qp:proxqp or my_law.py:MyLaw; as in the file if left out.")
+    ] = None,
     set_: Annotated[
         list[str] | None, typer.Option("--set", metavar="PATH=VALUE", help="Override a field: avoidance.d2=0.30")
     ] = None,
@@ -41,8 +43,8 @@ def serve(
         if missing.name not in ("zmq", "msgpack"):
             raise
         raise ConfigError("qpavoid serve needs pyzmq and msgpack: pip install 'qpavoid[serve]'") from None
-    config = load_scenario(scenario, set_ or (), solver)
-    service = Service(config, heartbeat, host, port, motions)
+    config, law = scenario_with_law(scenario, set_ or (), solver)
+    service = Service(config, heartbeat, host, port, motions, law)
     if moving := moving_obstacles(config):
         rule = "moves as the scenario has it" if motions else "stands where the scenario has it at t = 0 (--motions)"
         ERR.print(f"until it is sent, each of these {rule}: {', '.join(moving)}", highlight=False, markup=False)

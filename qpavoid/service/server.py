@@ -20,6 +20,7 @@ from qpavoid.reason import ReasonKind
 from qpavoid.service import messages
 from qpavoid.service.holding import HeldObstacles, HeldTargets, without_motions
 from qpavoid.service.messages import Fault, Refusal, Request
+from qpavoid.solvers import Solver
 
 _QUEUE = 32
 """Messages that wait, of each client and to each listener: older commands are dropped, further requests not taken."""
@@ -66,6 +67,7 @@ class Service:
         host: str = "127.0.0.1",
         port: int = 5570,
         follows_motions: bool = False,
+        law: Solver | None = None,
     ) -> None:
         """Build the scenario's controller, and bind the sockets.
 
@@ -76,6 +78,7 @@ class Service:
             port: of requests; that of commands is the next one. 0: any that are free.
             follows_motions: whether targets and obstacles that a step leaves out move as the scenario has it; else
                 targets are held, and obstacles stand.
+            law: replaces the scenario's solver; None: it stays.
 
         Raises:
             ConfigError: an address or port that cannot be had, a heartbeat of less than two control periods.
@@ -84,6 +87,7 @@ class Service:
         if not 2.0 * scenario.dt <= heartbeat <= 10.0:
             raise ConfigError(f"heartbeat: {heartbeat} s, expected {2.0 * scenario.dt:g} (two dt) to 10")
         controller, q0 = Controller.from_scenario(scenario)
+        controller.solver = law or controller.solver
         self._controller, self._q0, self._heartbeat = controller, q0, heartbeat
         self._context = zmq.Context()
         self._requests, self._commands = self._context.socket(zmq.ROUTER), self._context.socket(zmq.PUB)

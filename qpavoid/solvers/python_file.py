@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import inspect
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import lru_cache
 from pathlib import Path
 from types import ModuleType
@@ -13,7 +13,9 @@ from typing import Any
 
 import numpy as np
 
+from qpavoid.config import ScenarioConfig
 from qpavoid.config.files import read_text
+from qpavoid.config.loading import load_scenario
 from qpavoid.errors import ConfigError, UnknownName, nearest
 from qpavoid.problem import Problem, Solution, require_finite
 from qpavoid.solvers.solver import Solver
@@ -74,6 +76,24 @@ class OwnLaw(Solver):
 def names_file(name: str) -> bool:
     """Return whether a name is that of a law in a file, as in `my_law.py:MyLaw`, and not of one that ships."""
     return name.endswith(".py") or name.rpartition(":")[0].endswith(".py")
+
+
+def scenario_with_law(
+    name_or_path: str | Path, overrides: Sequence[str] = (), solver: str | None = None
+) -> tuple[ScenarioConfig, Solver | None]:
+    """Read a scenario, and the law that replaces its solver where that is given as `my_law.py:MyLaw`, else None.
+
+    Args:
+        name_or_path: as in `load_scenario`.
+        overrides: as there.
+        solver: as there, or the law of a Python file.
+
+    Raises:
+        ConfigError, UnknownName: the scenario or the law cannot be read.
+    """
+    if solver is not None and names_file(solver):
+        return load_scenario(name_or_path, overrides), solver_from_file(solver)
+    return load_scenario(name_or_path, overrides, solver), None
 
 
 def solver_from_file(name: str) -> Solver:

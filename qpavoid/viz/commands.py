@@ -15,6 +15,7 @@ from qpavoid.errors import ConfigError
 from qpavoid.run.log import Log
 from qpavoid.run.simulate import simulate
 from qpavoid.run.terminal import OUT, names_of, progress
+from qpavoid.solvers.python_file import scenario_with_law
 
 Sets = Annotated[
     list[str] | None, typer.Option("--set", metavar="PATH=VALUE", help="Override a field: avoidance.d2=0.30")
@@ -27,7 +28,9 @@ def view(
     sources: Annotated[
         list[str], typer.Argument(metavar="SCENARIO | LOG...", help="A scenario, or logs of `qpavoid run`.")
     ],
-    solver: Annotated[str | None, typer.Option(help="Such as eq10 or qp:proxqp; as in the file if left out.")] = None,
+    solver: Annotated[
+        str | None, typer.Option(help="Such as eq10, qp:proxqp or my_law.py:MyLaw; as in the file if left out.")
+    ] = None,
     set_: Sets = None,
     beside: Annotated[str | None, typer.Option(help="Solver of a second robot in the same scene, translucent.")] = None,
     port: Annotated[int, typer.Option(help="Of the page; the next free one if it is taken.")] = 8080,
@@ -58,7 +61,10 @@ def render(
     gif: Annotated[Path | None, typer.Option(help="Film to write.")] = None,
     mp4: Annotated[Path | None, typer.Option(help="Film to write; needs imageio-ffmpeg.")] = None,
     png: Annotated[Path | None, typer.Option(help="Picture of the closest moment of the first run.")] = None,
-    solvers: Annotated[str | None, typer.Option(help="Of a scenario, side by side: tracking and its own.")] = None,
+    solvers: Annotated[
+        str | None,
+        typer.Option(help="Of a scenario, side by side: tracking and its own; FILE.py:NAME for one of yours."),
+    ] = None,
     set_: Sets = None,
     width: Annotated[int, typer.Option(min=64, max=3840, help="Of the film [pixels].")] = 720,
     fps: Annotated[float, typer.Option(min=1.0, max=60.0, help="Pictures a second.")] = 15.0,
@@ -79,7 +85,8 @@ def render(
         config = load_scenario(sources[0], set_ or ())
         beside = "" if config.contacts else "tracking,"  # which holds no contacts
         names = names_of("--solvers", f"{beside}{config.solver.label}" if solvers is None else solvers)
-        logs = [simulate(load_scenario(sources[0], set_ or (), name)) for name in dict.fromkeys(names)]
+        jobs = [scenario_with_law(sources[0], set_ or (), name) for name in dict.fromkeys(names)]
+        logs = [simulate(config, law) for config, law in jobs]
     if len(logs) > _MAX_LOGS:
         raise ConfigError(f"{len(logs)} runs: at most {_MAX_LOGS} are shown side by side")
     for log in logs:

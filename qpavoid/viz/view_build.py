@@ -9,13 +9,14 @@ from typing import NamedTuple
 import numpy as np
 
 from qpavoid.config import Box, Capsule, Cylinder, ObstacleShape, ScenarioConfig, Sphere
-from qpavoid.config.loading import load_scenario
 from qpavoid.control.tick import Tick
 from qpavoid.controller import Controller
 from qpavoid.errors import QpavoidError
 from qpavoid.model.sample import Sample
 from qpavoid.problem import Array
 from qpavoid.run.simulate import Follower
+from qpavoid.solvers import Solver
+from qpavoid.solvers.python_file import scenario_with_law
 
 SHAPES = ("ball", "box", "capsule", "cylinder")
 """Shapes of obstacles that a page adds."""
@@ -39,7 +40,7 @@ def build_runs(name: str, sets: Sequence[str], solvers: Sequence[str | None], re
     Args:
         name: shipped name or path.
         sets: overrides of fields.
-        solvers: as in `load_scenario`.
+        solvers: as in `scenario_with_law`.
         removed: names of the obstacles that are left out.
 
     Raises:
@@ -47,22 +48,23 @@ def build_runs(name: str, sets: Sequence[str], solvers: Sequence[str | None], re
     """
     configs = configs_of(name, sets, solvers, removed)
     controllers, q0 = [], np.zeros(0)
-    for config in configs:
+    for config, law in configs:
         controller, q0 = Controller.from_scenario(config)
+        controller.solver = law or controller.solver
         controllers.append(controller)
-    return Runs(configs[0], q0, controllers)
+    return Runs(configs[0][0], q0, controllers)
 
 
 def configs_of(
     name: str, sets: Sequence[str], solvers: Sequence[str | None], removed: set[str]
-) -> list[ScenarioConfig]:
-    """Return the configurations of these controllers; see `build_runs`."""
+) -> list[tuple[ScenarioConfig, Solver | None]]:
+    """Return the configurations of these controllers, and laws from files; see `build_runs`."""
     configs = []
     for solver in solvers:
-        config = load_scenario(name, sets, solver)
+        config, law = scenario_with_law(name, sets, solver)
         present = [obstacle for obstacle in config.obstacles if obstacle.name not in removed]
         changes = {"obstacles": present, "spare_obstacles": max(config.spare_obstacles, _SPARE)}
-        configs.append(config.model_copy(update=changes).with_source(config.source))
+        configs.append((config.model_copy(update=changes).with_source(config.source), law))
     return configs
 
 

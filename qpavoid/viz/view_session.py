@@ -55,7 +55,7 @@ class Session:
         Args:
             scenario: shipped name or path.
             sets: overrides of fields, `avoidance.d2=0.30`.
-            solver: as in `load_scenario`.
+            solver: as in `scenario_with_law`.
             beside: solver of a second robot in the same scene, which is shown translucent; None: there is none.
             port: see `View`.
             host: see `View`.
@@ -89,7 +89,7 @@ class Session:
 
     def _open_page(self, port: int, host: str, quality: str) -> View:
         """Start the page, which shows the scene while the controller is built."""
-        config = configs_of(*self._build_arguments())[0]
+        config, law = configs_of(*self._build_arguments())[0]
         parts = build_parts(config)
         frames, scene, q0 = in_order(parts.tasks)[0], parts.scene, parts.q0
         times = np.linspace(0.0, config.duration, _PLANNED_POINTS)
@@ -99,7 +99,9 @@ class Session:
         )
         targets = [(task.settings.label, task.turns) for task in frames]
         setup = page_setup(scene.robot, [], targets, config.title or config.source.stem, q0, planned, nearby)
-        setup.controls = _controls(config, self._beside, [o.name for o in config.obstacles])
+        setup.controls = _controls(
+            config, self._solver if law else None, self._beside, [o.name for o in config.obstacles]
+        )
         setup.others, setup.waiting = ["beside"], _WAITING
         setup.port, setup.host, setup.quality, setup.rate = port, host, quality, _RATE
         view = View.of_setup(setup, scene)
@@ -303,9 +305,9 @@ class Session:
                 self.loops[number].tick = loops_now[0].tick if loops_now else None
 
 
-def _controls(config: ScenarioConfig, beside: str, obstacles: Sequence[str]) -> dict[str, Any]:
-    """Return choices and values of the controls of a scenario's page."""
-    solver, row = config.solver.label, config.avoidance.row.type
+def _controls(config: ScenarioConfig, own: str | None, beside: str, obstacles: Sequence[str]) -> dict[str, Any]:
+    """Return choices and values of the controls of a scenario's page; `own` names the law of a file, if that runs."""
+    solver, row = own or config.solver.label, config.avoidance.row.type
     solvers = tuple(dict.fromkeys([solver, *SOLVERS]))
     return {
         "hint": _HINT.format(f"the {obstacles[0]}" if obstacles else "an obstacle, added below,"),
