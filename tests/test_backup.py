@@ -9,6 +9,7 @@ from qpavoid import Avoidance, Controller, Limits, Obstacle, ReasonKind, Sample,
 from qpavoid.config import Box, Circle, Line, Sphere
 from qpavoid.model.trajectory import build_motion
 from qpavoid.safety.rollout import BackupRollouts
+from qpavoid_bench.arena.families import load_family, make_case
 
 DT = 0.01
 GAP = 0.5
@@ -160,6 +161,19 @@ def test_every_step_has_an_outcome_where_nothing_stays_clear(tmp_path):
 
 
 # --- a contact that no trajectory avoids ---------------------------------------------------------------------------
+
+
+def test_a_way_out_is_taken_though_the_solver_leads_elsewhere_by_now():
+    """At 500 Hz, balls and bars on a Panda that rests: a candidate takes four steps, and contact is 0.28 s ahead."""
+    scenario = make_case(load_family("adversarial"), 1224).scenario
+    controller, q = Controller.from_scenario(scenario)
+    scene, dt = controller.scene, scenario.dt
+    ruler, moving = Ruler(scene), [(i, slot.motion) for i, slot in enumerate(scene.slots) if slot.moves]
+    least = np.inf
+    for k in range(150):
+        q = q + dt * controller.step(q, k * dt).v
+        least = min(least, ruler.distances(q, {i: motion.sample((k + 1) * dt) for i, motion in moving}).min())
+    assert least > 0.0
 
 
 def test_further_contacts_are_avoided_after_an_unavoidable_one(tmp_path):

@@ -31,7 +31,7 @@ from qpavoid.kernels.rollout import FINISHED, HORIZON, PAUSED, TOUCH
 from qpavoid.problem import Array, Mask, Proximity
 from qpavoid.safety.approach import ApproachCheck, SettledSteps
 from qpavoid.safety.candidates import BackupPolicies, Command
-from qpavoid.safety.rollout import LEAST_SCORE, BackupRollouts, BackupScore, BackupTrajectory, Start
+from qpavoid.safety.rollout import LEAST_SCORE, ROUND_OFF, BackupRollouts, BackupScore, BackupTrajectory, Start
 
 _PERIOD_FRACTION = 0.128
 """Fraction of a control period in which candidates are computed [-]."""
@@ -55,6 +55,8 @@ _PORTION = 4
 step, these at least."""
 _DISTANCE_TOLERANCE = 1e-6
 """Difference of two clearances that counts as none [m]."""
+_CLOSE = 5e-3
+"""Distance by which points of the robot may be off a trajectory that is followed because others are worse [m]."""
 _WITH_TASK, _ALONE = range(2)
 """Kinds of candidates: with the velocity of the solver first; with that of the kept trajectory alone."""
 _CYCLE = 8, 4
@@ -175,7 +177,7 @@ class BackupPlanner:
                 command = Command(backup.v[0], self._after(state, backup.v[0]), after_task, False)
         else:
             self._backup = None
-        command = self._search(command, command.is_task or self._is_valid(backup, state))
+        command = self._search(state, command, command.is_task or self._is_valid(backup, state))
         self.is_cut = self._backup is None and self._budget.is_spent
         return None if command.is_task else _unless_equal(command.v, v)
 
@@ -204,10 +206,14 @@ class BackupPlanner:
         """Return whether the search has just begun, and the best trajectory so far leads to no contact soon."""
         return self._untried > 0 and backup.score.time_to_contact > _URGENT
 
-    def _search(self, command: Command, is_valid: bool) -> Command:
+    def _search(self, state: Start, command: Command, is_valid: bool) -> Command:
         """Evaluate the poses of this control step; return what is commanded with what they show.
 
+        A candidate with the velocity of the solver, of some steps ago, may be better than what is kept, and yet not fit
+        that velocity as it is now: then it is kept and followed instead.
+
         Args:
+            state: present one.
             command: of this control step, with the kept trajectory.
             is_valid: whether that is certainly sufficient.
         """
@@ -232,10 +238,10 @@ class BackupPlanner:
                     continue
                 break
             kind, self._kind = self._kind, -1
-            candidate = rollouts.result() if code == FINISHED else None
-            if candidate is None or len(candidate.v) <= self._age:
+            begun = rollouts.result() if code == FINISHED else None
+            if begun is None or len(begun.v) <= self._age:
                 continue
-            candidate = rollouts.advance(candidate, self._age)
+            candidate = rollouts.advance(begun, self._age)
             if kind == _ALONE:
                 self._backup, self._lasting_steps = candidate, 0
             elif self._is_acceptable(candidate, command.after_task):
@@ -245,6 +251,13 @@ class BackupPlanner:
                     self._policies.begin()
                     if self._age == 0:
                         break
+            elif (
+                self._age and not command.is_task and self._backup is not None and candidate.score > self._backup.score
+            ):
+                now = rollouts.advance(begun, self._age - 1)
+                if self._begins_at(now, state):
+                    self._backup, self._lasting_steps = candidate, 0
+                    command = command._replace(v=now.v[0], after=self._after(state, now.v[0]))
         return command
 
     def _lasts(self, command: Command) -> bool:
@@ -278,6 +291,11 @@ class BackupPlanner:
         clearance = self._rollouts.clearance_from(candidate, after_task)  # the solver may lead elsewhere by now
         score = candidate.score._replace(clearance=min(clearance, candidate.score.clearance))
         return clearance >= TOUCH and self._not_worse(score, backup.score)
+
+    def _begins_at(self, trajectory: BackupTrajectory, state: Start) -> bool:
+        """Return whether a trajectory begins close to a state: limits and recovery may have changed commands."""
+        offset = trajectory.clearance - self._rollouts.clearance_from(trajectory, state)
+        return abs(state.t - trajectory.start.t) <= ROUND_OFF and offset <= _CLOSE
 
     def _begin(self, command: Command, is_valid: bool, poses: int) -> None:
         """Begin the next candidate, of which some poses can be evaluated in this control step."""
