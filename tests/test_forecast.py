@@ -38,7 +38,7 @@ def make_forecaster(scenario):
     settings = ControlSettings(parts.scene, bounds, avoidance, scenario.limits, scenario.dt)
     forecaster = Forecaster(settings, parts.tasks, parts.contacts, scenario.solver, Planning())
     zero = np.zeros(parts.scene.robot.model.nv)
-    return forecaster, Snapshot(0.0, parts.q0, zero, zero, TRACK, {}, {}, {})
+    return forecaster, Snapshot(0.0, parts.q0, zero, zero, TRACK, (), np.zeros((0, 18)), {}, {})
 
 
 def forecast(scenario):
@@ -68,7 +68,7 @@ def test_margin_of_obstacles_that_turn_grows_in_forecasts():
     """With it, the robot keeps farther from where they really are; the next forecast knows nothing of it."""
     forecaster, start = make_forecaster(load_scenario("chasing_sphere"))
     fist = forecaster.scene.obstacles[0]
-    start = start._replace(obstacles={fist.name: fist.motion.sample(0.0).row.copy()})
+    start = start._replace(obstacles=(fist.name,), states=fist.motion.sample(0.0).row[None].copy())
     without, wary = forecaster.run(start, 2.0), forecaster.run(start._replace(spread=0.1), 2.0)
     assert without.clearance[-1] > wary.clearance[-1] > without.clearance[-1] - MAX_SPREAD + 0.01
     assert forecaster.run(start, 2.0).q.tobytes() == without.q.tobytes()
