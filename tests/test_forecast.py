@@ -105,6 +105,24 @@ def test_late_law_is_hurried(panda):
     assert all(solution.status is Status.SOLVED for solution in solutions)
 
 
+def test_end_of_a_run_is_the_deadline_of_its_forecasts(panda):
+    """The law would settle in time, but not before the run ends, which is when goals count; so it is hurried."""
+    tool, solutions = run(reaching(panda, settle=4.0, deadline=1.2), panda.home, 1.2)
+    assert np.linalg.norm(tool[0] + TOO_FAR - tool[-1]) < 0.005
+    assert solutions[-1].plan.startswith("fast finish")
+    scenario = load_scenario("situation1").model_copy(update={"planning": Planning()})
+    assert scenario.planning_in_time.deadline == scenario.duration
+    own = scenario.model_copy(update={"planning": Planning(deadline=0.7)})
+    assert own.planning_in_time.deadline == 0.7
+
+
+def test_deadline_that_has_passed_is_none(panda):
+    """Nothing arrives until then; from then on, what counts is the time that targets have after their motion."""
+    _, solutions = run(reaching(panda, settle=1.2, deadline=0.1), panda.home, 1.0)
+    assert not any(solution.plan for solution in solutions[:10])
+    assert solutions[60].plan.startswith("fast finish")
+
+
 def test_fast_finish_keeps_limits_and_safety_distance(panda):
     """Dampers let the tool close faster, and no nearer to the ball than the safety distance."""
     controller = reaching(panda)

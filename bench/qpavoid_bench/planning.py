@@ -32,7 +32,7 @@ _LEAD_IN = 40
 _ALONE, _AGAIN, _PLANS, _BESIDE = "none", "none, again", "process", "none, beside the same work"
 """What goes on beside a loop."""
 _BUSY = "from qpavoid_bench.planning import look_ahead_for_ever; look_ahead_for_ever()"
-"""What the program runs that does the same work for nobody."""
+"""What the program runs that does the same work without any loop."""
 
 
 def planning(
@@ -76,7 +76,7 @@ def _sections(steps: int) -> Iterator[str]:
 
 
 def _compare_parts(name: str, result: dict[str, tuple[Any, float]], other: str, one: str = _PLANS) -> str:
-    """Return in a sentence how times of steps, with planning if not told, compare with those of another loop."""
+    """Return in a sentence how times of steps of one loop compare with those of another one."""
     parts = []
     for row, part in ((0, "step"), (1, "CPU")):
         without, plans = (1e-3 * np.percentile(result[beside][0][row], [50, 99]) for beside in (other, one))

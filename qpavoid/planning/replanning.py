@@ -93,7 +93,9 @@ class Replanning:
         kernels.strays(q, errors, 0.0, np.zeros(1), q[None].copy(), np.zeros(1), _CHANGED, _TURNED)
         kernels.any_off_course(states, which, _NO_STATES, 0.0, 0.0, _CHANGED, _TURNED)
         kernels.note_courses(states, which, _NO_STATES, 0.0, _NO_STATES.copy())
-        kernels.surprise(states, which, _NO_STATES, self._settings.dt, 0.0, _CHANGED)
+        self._surprise_arguments = float(self._settings.dt), float(self._config.period), _CHANGED
+        none = _NO_STATES.copy(), *self._surprise_arguments
+        self._surprise = kernels.direct(kernels.surprise, states, which, *none)
 
     def reset(self) -> None:
         """Drop all plans; the next step looks ahead."""
@@ -239,7 +241,7 @@ class Replanning:
         tracker, last = self._builder.tracker, self._last_states
         which, states = tracker.external, tracker.current.states
         if len(last) == len(which):
-            worst, turns = kernels.surprise(states, which, last, self._settings.dt, self._config.period, _CHANGED)
+            worst, turns = self._surprise(states, which, last, *self._surprise_arguments)
             self._measured += 1
             weight = max(_FORGETTING, 1.0 / self._measured)
             self._noise += weight * (worst - self._noise)
