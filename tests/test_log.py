@@ -4,6 +4,7 @@ from dataclasses import fields
 
 import numpy as np
 import pytest
+from closed_loop import Ruler
 
 from qpavoid import ConfigError, Controller, Log, ScenarioConfig, Severity, load_scenario
 from qpavoid.run.log import STATUSES
@@ -36,6 +37,23 @@ def test_closest_pair_holds_the_smallest_distance(log):
         near = [name for name in log.meta["pairs"][log.closest_pair[k]] if name in bodies]
         assert near
         assert {log.body_distance[k, bodies.index(name)] for name in near} == {log.min_distance[k]}
+
+
+@pytest.mark.parametrize("scenario", ["five_spheres", "panda_line", "ur5_pole"])
+def test_distance_of_each_body_is_that_of_its_nearest_pair(scenario):
+    """Among all pairs, each measured on its own: balls roll by, and what is nearest changes all the time."""
+    config = load_scenario(scenario)
+    log, (controller, _) = simulate(config), Controller.from_scenario(config)
+    scene, ruler = controller.scene, Ruler(controller.scene)
+    moving = [(i, obstacle.motion) for i, obstacle in enumerate(scene.slots) if obstacle.moves]
+    bodies = len(scene.body_names)
+    of_body = [np.flatnonzero((scene.pairs == i).any(axis=1)) for i in range(bodies)]
+    for k in range(0, len(log.t), 7):
+        distances = ruler.distances(log.q[k], {i: motion.sample(log.t[k]) for i, motion in moving})
+        assert distances.min() == pytest.approx(log.min_distance[k], abs=1e-9)
+        for i, pairs in enumerate(of_body):
+            assert log.body_distance[k, i] == pytest.approx(np.min(distances[pairs], initial=np.inf), abs=1e-9)
+            assert distances[log.body_pair[k, i]] == pytest.approx(log.body_distance[k, i], abs=1e-9)
 
 
 def test_saved_and_loaded_log_is_the_same(log, tmp_path):

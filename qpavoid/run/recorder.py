@@ -52,7 +52,7 @@ class Recorder:
         self._scene, self._scenario = scene, scenario
         self._frames, self._other_tasks = in_order(controller.tasks)
         self._controller, self._plant = controller, plant
-        self._measuring = StateMeasurement(controller, _CHUNK)  # of all pairs, near or not
+        self._measuring = StateMeasurement(controller, _CHUNK)  # of pairs near or not
         self._ends, self._radii = _drawing_axes(scene.robot)
         sizes = {"N": ticks, "nq": model.nq, "nv": model.nv, "k": len(self._frames), "s": len(self._other_tasks)}
         sizes |= {"m": len(plant.torque) if plant else 0, "c": len(plant.point_names) if plant else 0}
@@ -193,6 +193,7 @@ class Recorder:
             if obstacle.name in attached:
                 counted_body[np.flatnonzero(scene.obstacle_of == i)] = _attachment_body(scene, attached[obstacle.name])
         bodies, count = counted_body[scene.pairs], len(scene.pairs)
+        self._measuring.count_for(bodies)
         lists = [np.flatnonzero((bodies == body).any(axis=1)) for body in range(len(self._ends))]
         self._pairs_of = np.full((len(lists), max(map(len, lists), default=0) + 1), count)  # one that is infinitely far
         for row, pairs in zip(self._pairs_of, lists, strict=True):
