@@ -174,7 +174,7 @@ class Controller(SceneChanges, SplitStep, ClosedLoops):
         with located(str(source)):
             controller = cls(
                 parts.scene, parts.tasks, parts.solver, scenario.dt, scenario.avoidance, scenario.limits,
-                scenario.sensing, scenario.progress, parts.contacts, scenario.latency, scenario.planning,
+                scenario.sensing, scenario.progress, parts.contacts, scenario.latency, scenario.planning_in_time,
                 scenario.budget, scenario.dynamics,
             )  # fmt: skip
         for c in scenario.obstacles:

@@ -38,7 +38,7 @@ def make_forecaster(scenario):
     settings = ControlSettings(parts.scene, bounds, avoidance, scenario.limits, scenario.dt)
     forecaster = Forecaster(settings, parts.tasks, parts.contacts, scenario.solver, Planning())
     zero = np.zeros(parts.scene.robot.model.nv)
-    return forecaster, Snapshot(0.0, parts.q0, zero, zero, TRACK, {}, {}, {})
+    return forecaster, Snapshot(0.0, parts.q0, zero, zero, TRACK, (), np.zeros((0, 18)), {}, {})
 
 
 def forecast(scenario):
@@ -68,7 +68,7 @@ def test_margin_of_obstacles_that_turn_grows_in_forecasts():
     """With it, the robot keeps farther from where they really are; the next forecast knows nothing of it."""
     forecaster, start = make_forecaster(load_scenario("chasing_sphere"))
     fist = forecaster.scene.obstacles[0]
-    start = start._replace(obstacles={fist.name: fist.motion.sample(0.0).row.copy()})
+    start = start._replace(obstacles=(fist.name,), states=fist.motion.sample(0.0).row[None].copy())
     without, wary = forecaster.run(start, 2.0), forecaster.run(start._replace(spread=0.1), 2.0)
     assert without.clearance[-1] > wary.clearance[-1] > without.clearance[-1] - MAX_SPREAD + 0.01
     assert forecaster.run(start, 2.0).q.tobytes() == without.q.tobytes()
@@ -103,6 +103,24 @@ def test_late_law_is_hurried(panda):
     assert not any(plans[:10]) and all(plans[10:])
     assert plans[10].startswith("fast finish since 0.10 s: the present drive would end ")
     assert all(solution.status is Status.SOLVED for solution in solutions)
+
+
+def test_end_of_a_run_is_the_deadline_of_its_forecasts(panda):
+    """The law would settle in time, but not before the run ends, which is when goals count; so it is hurried."""
+    tool, solutions = run(reaching(panda, settle=4.0, deadline=1.2), panda.home, 1.2)
+    assert np.linalg.norm(tool[0] + TOO_FAR - tool[-1]) < 0.005
+    assert solutions[-1].plan.startswith("fast finish")
+    scenario = load_scenario("situation1").model_copy(update={"planning": Planning()})
+    assert scenario.planning_in_time.deadline == scenario.duration
+    own = scenario.model_copy(update={"planning": Planning(deadline=0.7)})
+    assert own.planning_in_time.deadline == 0.7
+
+
+def test_deadline_that_has_passed_is_none(panda):
+    """Nothing arrives until then; from then on, what counts is the time that targets have after their motion."""
+    _, solutions = run(reaching(panda, settle=1.2, deadline=0.1), panda.home, 1.0)
+    assert not any(solution.plan for solution in solutions[:10])
+    assert solutions[60].plan.startswith("fast finish")
 
 
 def test_fast_finish_keeps_limits_and_safety_distance(panda):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from closed_loop import Awaited
 
-from qpavoid import Controller, Obstacle, Points, Sample, build_scene, build_tasks, simulate
+from qpavoid import Controller, Obstacle, Points, Sample, build_scene, build_tasks, kernels, simulate
 from qpavoid.config import Box, Capsule, Planning, PointCloud, Sphere, Task
 from qpavoid.planning import worker
 from qpavoid.viz.compare import path_figure, solver_styles
@@ -107,6 +107,45 @@ def test_obstacle_that_turns_is_looked_at_at_once(panda, monkeypatch):
     np.testing.assert_allclose(Counted.times, [0.0, 0.4, 0.8, 0.9], atol=0.021)
 
 
+@pytest.mark.parametrize(("noise", "is_noisy"), [(0.0, False), (0.04, True)])
+def test_velocities_that_differ_in_every_step_are_no_base_for_plans(noise, is_noisy, panda, monkeypatch):
+    """Positions are exact: where velocities lead within a period is what counts. One turn is no noise."""
+    asked = []
+
+    class Recorded(worker.InlineWorker):
+        def ask(self, question):
+            super().ask(question)
+            asked.append(question.is_noisy)
+
+    monkeypatch.setattr(worker, "InlineWorker", Recorded)
+    scene = build_scene(panda, [Obstacle.at("ball", Sphere(radius=0.05), [0.9, 0.0, 0.9], external=True)])
+    tasks = build_tasks([Task(frame="panda_hand_tcp")], panda, panda.home)
+    controller = Controller(scene, tasks, planning=Planning(settle=0.5, clearances=[], fast=None))
+    position, velocity, random = np.array([0.9, -0.3, 0.9]), np.array([0.0, 0.2, 0.0]), np.random.default_rng(0)
+    for k in range(130):
+        if k == 90:
+            velocity = np.array([0.0, 0.0, 0.2])
+        seen = Sample.at(position, np.eye(3), linear=velocity + noise * random.normal(size=3))
+        controller.step(panda.home, 0.01 * k, obstacles={"ball": seen})
+        position = position + 0.01 * velocity
+    assert asked[0] and len(asked) > 3  # nothing is known of the first one yet
+    assert set(asked[1:]) == {is_noisy}
+
+
+def test_where_nothing_is_planned_few_steps_are_compared_with_the_forecast(panda, monkeypatch):
+    """The forecast arrives, and obstacles rest: in a second, every fifth step is compared, and not every one."""
+    compared = []
+    compare = kernels.strays
+    monkeypatch.setattr(kernels, "strays", lambda *x: compared.append(x[2]) or compare(*x))
+    scene = build_scene(panda, [Obstacle.at("ball", Sphere(radius=0.05), [0.9, 0.0, 0.9])])
+    tasks = build_tasks([Task(frame="panda_hand_tcp")], panda, panda.home)
+    controller = Controller(scene, tasks, planning=Planning(settle=2.0))
+    compared.clear()
+    for k in range(150):
+        controller.step(panda.home, 0.01 * k)
+    assert 10 <= len(compared) <= 30
+
+
 def test_answer_that_is_two_seconds_late_changes_nothing(monkeypatch):
     """Commands are those of the law, bit for bit, while it is awaited, and what comes too late is not followed."""
     case = make_case(load_family("shelf"), 1)
@@ -129,9 +168,9 @@ def test_robot_comes_to_rest_where_the_goal_is_out_of_reach(seed, monkeypatch):
 
 
 @pytest.mark.slow
-def test_among_obstacles_that_move_half_of_what_the_law_fails_at_arrives():
+def test_among_obstacles_that_move_most_of_what_the_law_fails_at_arrives():
     results = [run_trial(make_case(load_family(f), s), ENTRANTS["qp-planning"]) for f, seeds in LATE for s in seeds]
-    assert sum(result.success for result in results) >= 5
+    assert sum(result.success for result in results) >= 6
     assert sum(result.collided for result in results) <= 1
 
 

@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from time import perf_counter_ns, sleep, thread_time_ns
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import typer
@@ -25,14 +25,14 @@ _DT = 0.005
 """Period of the loops [s]."""
 _MOVING = 10
 """Obstacles of `circling` that move [-]."""
-_BLOCKS = 10
+_BLOCKS = 25
 """Blocks of each loop, in turn [-]."""
-_LEAD_IN = 100
+_LEAD_IN = 40
 """Steps of each block that are not timed [-]."""
-_ALONE, _PLANS, _BESIDE = "none", "process", "none, beside a busy program"
+_ALONE, _AGAIN, _PLANS, _BESIDE = "none", "none, again", "process", "none, beside the same work"
 """What goes on beside a loop."""
-_BUSY = "from qpavoid_bench.planning import control_for_ever; control_for_ever()"
-"""What the busy program runs."""
+_BUSY = "from qpavoid_bench.planning import look_ahead_for_ever; look_ahead_for_ever()"
+"""What the program runs that does the same work without any loop."""
 
 
 def planning(
@@ -55,9 +55,10 @@ def _sections(steps: int) -> Iterator[str]:
         "`nothing to plan`: the motions of all obstacles are known, so that the process looks ahead at the start and "
         "then rests. `always planning`: obstacles that move are given to each step, and the next look is asked for as "
         "soon as the one before is answered. `core`: of the process, of one core. `late`: how long after its time a "
-        "step begins. Beside a busy program, nothing is planned, while another process computes control steps of the "
-        "same scene without a pause and without a word: what that costs the loop, caches, memory and cores do, and not "
-        "planning. `CPU`: the processor's time of a step's thread."
+        "step begins. `none, again`: another controller of the same kind as `none`, so that its differences are what "
+        "the machine does, and no more can be read from others. Beside the same work, nothing is planned, while a "
+        "program that this loop knows nothing of looks ahead in the same scene without a pause: what that costs, "
+        "caches, memory and cores do. `CPU`: the processor's time of a step's thread."
     )
     head = ["loop", "planning", "", "p50 [µs]", "p99 [µs]", "p99.9 [µs]", "worst [µs]", "core"]
     rows, notes = [], []
@@ -69,22 +70,24 @@ def _sections(steps: int) -> Iterator[str]:
                 busy = f"{100 * load:.0f} %" if beside != _ALONE and not row else ""
                 rows.append([name, beside, part, *cells, busy])
         notes += [_compare_parts(name, result, other) for other in (_ALONE, _BESIDE) if other in result]
+        notes.append(_compare_parts(name, result, _ALONE, _AGAIN))
     yield table(head, rows, text_columns=3)
     yield "\n".join(f"- {note}" for note in notes)
 
 
-def _compare_parts(name: str, result: dict[str, tuple[Any, float]], other: str) -> str:
-    """Return in a sentence how times of steps with planning compare with those of another loop."""
+def _compare_parts(name: str, result: dict[str, tuple[Any, float]], other: str, one: str = _PLANS) -> str:
+    """Return in a sentence how times of steps of one loop compare with those of another one."""
     parts = []
     for row, part in ((0, "step"), (1, "CPU")):
-        without, plans = (1e-3 * np.percentile(result[beside][0][row], [50, 99]) for beside in (other, _PLANS))
+        without, plans = (1e-3 * np.percentile(result[beside][0][row], [50, 99]) for beside in (other, one))
         parts.append(f"{part}: median {plans[0] / without[0]:.2f} times, p99 {plans[1] - without[1]:+.1f} µs")
-    return f"{name}, with the process against {other}: {'; '.join(parts)}."
+    return f"{name}, `{one}` against `{other}`: {'; '.join(parts)}."
 
 
 def _compare(is_given: bool, steps: int) -> dict[str, tuple[Any, float]]:
     """Return times (3, steps) [ns] by what goes on beside the loop, see `_pace`, and the load of a core by that."""
-    loops = {_ALONE: _make_loop(is_given, False), _PLANS: _make_loop(is_given, True)}
+    workers: dict[str, Literal["", "process"]] = {_ALONE: "", _AGAIN: "", _PLANS: "process"}
+    loops = {beside: _make_loop(is_given, worker) for beside, worker in workers.items()}
     if is_given:
         loops[_BESIDE] = loops[_ALONE]
     times: dict[str, list[Any]] = {beside: [] for beside in loops}
@@ -104,7 +107,7 @@ def _compare(is_given: bool, steps: int) -> dict[str, tuple[Any, float]]:
 
 @contextmanager
 def _busy_program() -> Iterator[subprocess.Popen[bytes]]:
-    """Start a program that computes control steps for ever, and stop it until it gets a SIGCONT."""
+    """Start a program that looks ahead for ever, and stop it until it gets a SIGCONT."""
     busy = subprocess.Popen([sys.executable, "-c", _BUSY], stdout=subprocess.PIPE)
     try:
         assert busy.stdout is not None
@@ -116,9 +119,10 @@ def _busy_program() -> Iterator[subprocess.Popen[bytes]]:
         busy.wait()
 
 
-def control_for_ever() -> None:
-    """Compute control steps of the scene without a pause; say so once they begin."""
-    loop = _make_loop(True, False)
+def look_ahead_for_ever() -> None:
+    """Look ahead in the scene without a pause, one step after the other; say so once it begins."""
+    os.nice(10)  # as the process that plans is
+    loop = _make_loop(True, "inline")
     print("begins", flush=True)
     while True:
         loop.advance(loop.step(None, None))
@@ -142,10 +146,10 @@ class _Given(Loop):
         self._inputs = t, None, {tuple(obstacle.name for obstacle in self._moving): rows}
 
 
-def _make_loop(is_given: bool, planned: bool) -> Loop:
+def _make_loop(is_given: bool, worker: Literal["", "inline", "process"]) -> Loop:
     scenario: ScenarioConfig = circling(_DT, backup=False)
-    if planned:
-        config = Planning(worker="process", period=_DT) if is_given else Planning(worker="process")
+    if worker:
+        config = Planning(worker=worker, period=_DT) if is_given else Planning(worker=worker)
         scenario = scenario.model_copy(update={"planning": config})
     loop = (_Given if is_given else Loop)(*Controller.from_scenario(scenario))
     return loop

@@ -182,6 +182,8 @@ class Planning(Block):
     """Longest time that a forecast looks ahead [s]."""
     settle: Positive = 3.0
     """Time after the end of the motions within which their targets are to be reached [s]."""
+    deadline: Positive | None = None
+    """Time at which they are to be reached at the latest [s]; left out: in a scenario its `duration`, else none."""
     period: Positive = 0.4
     """Time between two forecasts where obstacles move [s]."""
     lead: Positive = 0.3

@@ -108,6 +108,13 @@ class ScenarioConfig(Block):
         """The file that it was read from: named in messages, and the folder that relative paths start from."""
         return self._source
 
+    @property
+    def planning_in_time(self) -> Planning | None:
+        """The block `planning`, with the end of the run as its deadline unless it has one: that is when goals count."""
+        if self.planning is None or self.planning.deadline is not None:
+            return self.planning
+        return self.planning.model_copy(update={"deadline": self.duration})
+
     def with_source(self, source: Path) -> ScenarioConfig:
         """Return the same scenario, as if it had been read from `source`."""
         copy = self.model_copy()

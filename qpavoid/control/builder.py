@@ -87,6 +87,11 @@ class ProblemBuilder:
         self.begun: StepProblem | None = None
         """Step whose command is not known yet."""
 
+    @property
+    def gives_targets(self) -> bool:
+        """Whether the program gave any targets in the last step."""
+        return self._targets.are_given
+
     def read(self, q: Any, t: Any, targets: Any, obstacles: Any, v: Any, v_desired: Any = None) -> Arguments:
         """Check the arguments of a step, see `Controller.step`: whatever raises does so here, and changes nothing."""
         if self._budget.is_limited:

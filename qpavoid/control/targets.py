@@ -55,6 +55,11 @@ class TargetReader:
         self._takes_samples = not latency and len(tasks) == len(frames)
         """Whether there are only frames, whose samples count as they are given."""
 
+    @property
+    def are_given(self) -> bool:
+        """Whether the program gave any in the last step."""
+        return not self._is_written
+
     def read(self, t: float, targets: Mapping[str, Any] | None) -> Targets:
         """Return the targets of all tasks.
 

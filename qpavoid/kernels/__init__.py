@@ -64,7 +64,7 @@ from qpavoid.kernels.step import (
     tracking_violation,
     violation,
 )
-from qpavoid.kernels.straying import any_moves, any_off_course, strays, surprise
+from qpavoid.kernels.straying import any_off_course, note_courses, strays, surprise
 from qpavoid.kernels.structures import direct, pack
 from qpavoid.kernels.task_curvature import add_curvature
 from qpavoid.kernels.tasks import frame_rows, projection_cost
@@ -96,7 +96,6 @@ __all__ = [
     "add_curvature",
     "advance_rollout",
     "alpha",
-    "any_moves",
     "any_off_course",
     "assemble",
     "backup_rows",
@@ -134,6 +133,7 @@ __all__ = [
     "max_clearance_velocity",
     "minimize",
     "near_pairs",
+    "note_courses",
     "observe",
     "offset_after_step",
     "offset_of_start",

@@ -46,13 +46,30 @@ def strays(
 
 
 @compiled
-def any_moves(states: Array, which: IntArray) -> bool:
-    """Return whether any of some obstacles has a velocity, of states (o, 18)."""
-    for i in which:
-        for c in range(12, 18):
-            if states[i, c] != 0.0:
-                return True
-    return False
+def note_courses(states: Array, which: IntArray, earlier: Array, elapsed: float, now: Array) -> tuple[bool, float]:
+    """Note where k obstacles are, and compare that with where they were and what their velocities led to.
+
+    Args:
+        states: of all obstacles (o, 18).
+        which: their numbers (k,).
+        earlier: their states before (k, 18); of other obstacles (j, 18), nothing is compared.
+        elapsed: time since then [s].
+        now: their states (k, 18) are written here.
+
+    Returns:
+        Whether any of them has a velocity; how fast one of them has left its course since then, at most [m/s].
+    """
+    moves, square, known = False, 0.0, len(earlier) == len(which) and elapsed > 0.0
+    for k in range(len(which)):
+        for c in range(18):
+            now[k, c] = states[which[k], c]
+            moves = moves or (c >= 12 and now[k, c] != 0.0)
+        if known:
+            off = 0.0
+            for c in range(9, 12):
+                off += (now[k, c] - earlier[k, c] - elapsed * earlier[k, c + 3]) ** 2
+            square = max(square, off)
+    return moves, np.sqrt(square) / elapsed if known else 0.0
 
 
 @compiled
@@ -85,21 +102,31 @@ def any_off_course(
 
 
 @compiled
-def surprise(states: Array, which: IntArray, earlier: Array, dt: float) -> float:
-    """Return the largest square of what positions differ from those that twists led to [m²].
+def surprise(
+    states: Array, which: IntArray, earlier: Array, dt: float, horizon: float, moved: float
+) -> tuple[float, bool]:
+    """Compare k obstacles with what was known of them a step before.
 
     Args:
         states: of all obstacles (o, 18).
-        which: numbers of k of them (k,).
+        which: their numbers (k,).
         earlier: their states dt before (k, 18); brought up to date.
         dt: [s].
+        horizon: time for which velocities lead on [s].
+        moved: difference of a coordinate that does not count [m].
+
+    Returns:
+        The largest square of what positions differ from those that velocities led to [m²]; whether a velocity leads
+        elsewhere than that of the step before.
     """
-    worst = 0.0
+    worst, turns = 0.0, False
     for k in range(len(which)):
         square = 0.0
         for c in range(9, 12):
-            square += (states[which[k], c] - earlier[k, c] - dt * earlier[k, c + 3]) ** 2
+            off = states[which[k], c] - earlier[k, c] - dt * earlier[k, c + 3]
+            square += off**2
+            turns = turns or abs(off + horizon * (states[which[k], c + 3] - earlier[k, c + 3])) > moved
         worst = max(worst, square)
         for c in range(18):
             earlier[k, c] = states[which[k], c]
-    return worst
+    return worst, turns

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from math import isfinite
 from typing import Any, NamedTuple, cast
 
 import numpy as np
@@ -47,8 +46,10 @@ class Snapshot(NamedTuple):
     """(nv,) change of velocity in that step."""
     drive: Drive
     """What it follows."""
-    obstacles: Mapping[str, Array]
-    """(18,) states of those that a program gives, by name."""
+    obstacles: tuple[str, ...]
+    """Names of those that a program gives."""
+    states: Array
+    """(k, 18) their states."""
     clouds: Mapping[str, Voxels]
     """What is in point clouds among them that were given points."""
     targets: Mapping[str, Any]
@@ -137,8 +138,8 @@ class Forecaster(SceneChanges):
         self._driver = Driver(rows, self._arbiter, config, scene.robot.model, settings.dt)
         rows.adapt(self._arbiter.solver, settings.avoidance.look_ahead)
         ends = [task.motion.end_time if isinstance(task.motion, Trajectory) else np.inf for task in tasks]
-        self._deadline = max(ends[: rows.frame_count]) + config.settle
-        """Time until which all targets are to be reached [s]."""
+        self._settled = max(ends[: rows.frame_count]) + config.settle
+        """Time until which the targets of the motions are to be reached [s]."""
         self._least = np.zeros(len(scene.pairs))
         """(m,) distance that each pair has to keep [m]."""
 
@@ -153,11 +154,10 @@ class Forecaster(SceneChanges):
 
     def end_of(self, start: Snapshot) -> float:
         """Return the time at which a forecast ends [s]."""
-        config = self._config
-        deadline = start.t + config.settle if start.targets else self._deadline
-        if deadline <= start.t:
-            deadline = start.t + config.settle
-        return min(deadline, start.t + config.horizon) if isfinite(deadline) else start.t + config.horizon
+        config, now = self._config, start.t + 0.5 * self._settings.dt
+        settled = start.t + config.settle
+        times = settled if start.targets else self._settled, np.inf if config.deadline is None else config.deadline
+        return min(min((time for time in times if time > now), default=settled), start.t + config.horizon)
 
     def run(self, start: Snapshot, end: float) -> Forecast:
         """Roll a drive out.
@@ -198,18 +198,16 @@ class Forecaster(SceneChanges):
 
     def later(self, start: Snapshot, forecast: Forecast, step: int) -> Snapshot:
         """Return the state of a forecast that began at `start`, when one of its steps begins."""
-        states = {name: Sample.of_row(row).row.copy() for name, row in start.obstacles.items()}
-        t = float(forecast.t[step])
-        for row in states.values():
-            extrapolate(row[None], t - start.t)
-        return start._replace(t=t, q=forecast.q[step], v=forecast.v[step], dv=forecast.dv[step], obstacles=states)
+        states, t = start.states.copy(), float(forecast.t[step])
+        extrapolate(states, t - start.t)
+        return start._replace(t=t, q=forecast.q[step], v=forecast.v[step], dv=forecast.dv[step], states=states)
 
     def obstacles_at(self, start: Snapshot, t: float) -> ObstacleStates:
         """Return where obstacles are at a time [s], as known in the state in which a forecast begins."""
         tracker = self._builder.tracker
         states = tracker.at(t).states.copy()
         margin = np.array([obstacle.uncertainty for obstacle in self.scene.slots])
-        for name, row in start.obstacles.items():
+        for name, row in zip(start.obstacles, start.states, strict=True):
             index = tracker.index(name)
             states[index] = row
             extrapolate(states[index : index + 1], t - start.t)
@@ -248,10 +246,9 @@ class Forecaster(SceneChanges):
 
 def _updates(start: Snapshot) -> dict[str, Sample | Points] | None:
     """Return what a step is given of obstacles, None of none; points stay as they are."""
-    updates: dict[str, Sample | Points] = {name: Sample.of_row(row) for name, row in start.obstacles.items()}
-    for name, voxels in start.clouds.items():
-        updates[name] = Points(voxels, Sample.of_row(start.obstacles[name]), at_rest=True)
-    return updates or None
+    samples = {name: Sample.of_row(row) for name, row in zip(start.obstacles, start.states, strict=True)}
+    points = {name: Points(voxels, samples[name], at_rest=True) for name, voxels in start.clouds.items()}
+    return {**samples, **points} or None
 
 
 def _part(target: Any, moves: bool, turns: bool) -> Any:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -19,7 +20,7 @@ from qpavoid.planning.candidates import Decision, is_sound
 from qpavoid.planning.drive import TRACK, Driver
 from qpavoid.planning.forecast import Expected, Snapshot
 from qpavoid.planning.worker import Answer, Parts, Question, Worker, make_worker
-from qpavoid.problem import Array, Solution
+from qpavoid.problem import Array, IntArray, Solution
 from qpavoid.reason import Reason, ReasonKind
 from qpavoid.safety.arbiter import Arbiter
 from qpavoid.solvers import Solver
@@ -31,6 +32,8 @@ _CHANGED = 0.02
 """Difference of a task's error, or of an obstacle's position, from the forecast, after which it does not count [m]."""
 _TURNED = 0.1
 """The same of a joint, or of an obstacle's orientation [rad]."""
+_CHECKED = 0.05
+"""Time between two comparisons of the robot and its targets with a forecast [s]: a fraction of `lead`."""
 _STEADY = 1e-3
 """Rate at which obstacles may leave their courses that counts as none [m/s]: round-off, and slow turns."""
 _SOONEST = 0.1
@@ -39,7 +42,10 @@ _NOISE = 1e-3
 """Root mean square of what an obstacle's position differs from that of a step before and its twist, from which on
 twists are too noisy to plan with [m]: at 10 m/s², it is half as much."""
 _FORGETTING = 0.05
-"""Weight of the newest difference in that mean [-]."""
+"""Weight of the newest difference in that mean, and of the newest step in the share of those below [-]."""
+_UNSTEADY = 0.5
+"""Share of steps whose twist leads elsewhere within `period` than that of the step before, from which on twists are too
+noisy to plan with [-]."""
 _MEASURED = 20
 """Differences after which the mean counts; before that, obstacles that move may be noisy [-]."""
 _ROUND_OFF = 1e-9
@@ -86,8 +92,10 @@ class Replanning:
         q, errors = self._builder.rows.q, self._builder.rows.frame_errors
         kernels.strays(q, errors, 0.0, np.zeros(1), q[None].copy(), np.zeros(1), _CHANGED, _TURNED)
         kernels.any_off_course(states, which, _NO_STATES, 0.0, 0.0, _CHANGED, _TURNED)
-        kernels.any_moves(states, which)
-        kernels.surprise(states, which, _NO_STATES, self._settings.dt)
+        kernels.note_courses(states, which, _NO_STATES, 0.0, _NO_STATES.copy())
+        self._surprise_arguments = float(self._settings.dt), float(self._config.period), _CHANGED
+        none = _NO_STATES.copy(), *self._surprise_arguments
+        self._surprise = kernels.direct(kernels.surprise, states, which, *none)
 
     def reset(self) -> None:
         """Drop all plans; the next step looks ahead."""
@@ -98,10 +106,15 @@ class Replanning:
         self._question: Question | None = None
         self._asked_states = _NO_STATES  # of obstacles that a program gives, in the last look
         self._asked_clouds = dict[int, Voxels]()  # what was in clouds then
+        self._named: IntArray | None = None  # numbers of obstacles that have these names
+        self._names = tuple[str, ...]()
         self._last_look, self._next_look, self._wait = -np.inf, -np.inf, self._config.period
+        self._next_check = -np.inf  # of robot and targets against the forecast [s]
+        self._idle_until = -np.inf  # time before which steps are the law's alone, as far as is known [s]
         self._looks = 0
         self._last_states = _NO_STATES  # in the step before
         self._noise, self._measured = 0.0, 0  # mean square [m²], number of differences
+        self._unsteady = 0.0  # share of steps whose twist leads elsewhere than that of the step before
         self._compared_at = -np.inf  # step of the last difference [s]
         self._spread = 0.0  # mean square of the rate at which obstacles left their courses between looks [m²/s²]
 
@@ -126,14 +139,30 @@ class Replanning:
         self.reset()
 
     def leaves_alone(self, step: StepProblem) -> bool:
-        """Return whether a step is the law's alone: nothing is followed, to ask, to take over or to say."""
-        worker = self._worker
-        if worker is None or self._driver.drive is not TRACK or self._pending is not None:
+        """Return whether a step is the law's alone: nothing is followed, is to begin, or is to be said.
+
+        What is to be asked or taken over is, if that does not change it.
+        """
+        if step.t < self._idle_until:
+            return True
+        if self._worker is None or self._driver.drive is not TRACK or self._pending is not None:
             return False
         if self._no_plan is not None or self._notes:
             return False
+        self._look_ahead(step, self._worker)
+        if self._pending is not None or self._no_plan is not None or self._notes:
+            return False
+        if self._question is None and not self._has_given:
+            self._idle_until = min(step.t + _CHECKED, self._next_look) - _ROUND_OFF
+        return True
+
+    def _look_ahead(self, step: StepProblem, worker: Worker) -> None:
+        """Ask for a look ahead where one is due, and take an answer over where there is one."""
         self._compare(step.t)
-        return not (worker.has_answer() or (self._question is None and self._is_due(step)))
+        if self._pending is None and self._question is None and self._is_due(step):
+            self._ask(step, worker)
+        if worker.has_answer() and (answer := worker.poll()) is not None:
+            self._take(answer, step.t)
 
     def _compare(self, t: float) -> None:
         """Compare obstacles that a program gives with what the step before led to, once in each step."""
@@ -149,11 +178,8 @@ class Replanning:
         if self._pending is not None and step.t > self._pending.t + dt:  # steps were left out, or stops
             self._pending, self._next_look = None, step.t
         if self._no_plan is None and worker is not None:
-            self._compare(step.t)
-            if self._pending is None and self._question is None and self._is_due(step):
-                self._ask(step, worker)
-            if (answer := worker.poll()) is not None:
-                self._take(answer, step.t)
+            self._look_ahead(step, worker)
+        self._idle_until = -np.inf  # what follows may change that
         solution = self._driver.decide(step)
         if self._driver.drive.mode is not drive.mode:  # a path has ended
             self._next_look = step.t
@@ -171,25 +197,30 @@ class Replanning:
 
     def _is_due(self, step: StepProblem) -> bool:
         """Return whether to look ahead: time has come, or what was forecast does not come true."""
-        if step.t >= self._next_look - _ROUND_OFF:
+        t, period = step.t, self._config.period
+        if t >= self._next_look - _ROUND_OFF:
             return True
-        since = step.t - self._last_look + _ROUND_OFF
-        if since >= self._config.period:
-            return self._has_changed(step)
-        return since >= _SOONEST and not self._is_noisy and self._is_off_course(step.t)
+        since = t - self._last_look + _ROUND_OFF
+        is_watched = self._has_given and since >= (period if self._is_noisy else min(_SOONEST, period))
+        if is_watched and self._is_off_course(t):
+            return True
+        if since < period or t < self._next_check:
+            return False
+        self._next_check = t + _CHECKED - _ROUND_OFF
+        return self._has_changed(step)
+
+    @property
+    def _has_given(self) -> bool:
+        """Whether a program gives obstacles now, or did in the last look."""
+        return bool(len(self._builder.tracker.external) or len(self._asked_states))
 
     def _has_changed(self, step: StepProblem) -> bool:
-        """Return whether robot, targets or obstacles are elsewhere than in the forecast."""
-        expected, tracker = self._expected, self._builder.tracker
-        if expected is None:
+        """Return whether the robot or targets are elsewhere than in the forecast, or clouds have other points."""
+        expected, clouds = self._expected, self._builder.tracker.current.voxels
+        if expected is None or any(voxels is not self._asked_clouds.get(i) for i, voxels in clouds.items()):
             return True
-        if kernels.strays(
-            step.q, self._builder.rows.frame_errors, step.t, expected.t, expected.q, expected.errors, _CHANGED, _TURNED
-        ):
-            return True
-        if any(voxels is not self._asked_clouds.get(i) for i, voxels in tracker.current.voxels.items()):
-            return True
-        return self._is_off_course(step.t)
+        errors = self._builder.rows.frame_errors
+        return bool(kernels.strays(step.q, errors, step.t, expected.t, expected.q, expected.errors, _CHANGED, _TURNED))
 
     def _is_off_course(self, t: float) -> bool:
         """Return whether an obstacle that a program gives is elsewhere than the last look had it, at a time [s]."""
@@ -203,48 +234,45 @@ class Replanning:
     @property
     def _is_noisy(self) -> bool:
         """Whether twists are too noisy to plan with, or it is not known yet."""
-        return self._measured < _MEASURED or self._noise > _NOISE**2
+        return self._measured < _MEASURED or self._noise > _NOISE**2 or self._unsteady > _UNSTEADY
 
     def _measure_noise(self) -> None:
-        """Compare positions of obstacles with those that the twists of the step before lead to."""
+        """Compare obstacles with what their twists in the step before led to, once a step."""
         tracker, last = self._builder.tracker, self._last_states
         which, states = tracker.external, tracker.current.states
         if len(last) == len(which):
-            worst = kernels.surprise(states, which, last, self._settings.dt)
+            worst, turns = self._surprise(states, which, last, *self._surprise_arguments)
             self._measured += 1
-            self._noise += max(_FORGETTING, 1.0 / self._measured) * (worst - self._noise)
+            weight = max(_FORGETTING, 1.0 / self._measured)
+            self._noise += weight * (worst - self._noise)
+            self._unsteady += weight * (turns - self._unsteady)
         else:
             self._last_states = states[which]
 
-    def _measure_spread(self, states: Array, elapsed: float) -> None:
-        """Compare obstacles (k, 18) with where the look before had them, some time ago [s]."""
-        earlier = self._asked_states
-        if len(states) == 0 or len(earlier) != len(states) or not elapsed > 0.0:
-            return
-        off = states[:, 9:12] - earlier[:, 9:12] - elapsed * earlier[:, 12:15]
-        rate = float(np.sqrt((off * off).sum(axis=1).max())) / elapsed
-        self._spread += 0.5 * ((rate if rate > _STEADY else 0.0) ** 2 - self._spread)
-
     def _ask(self, step: StepProblem, worker: Worker) -> None:
         """Ask for a look ahead from a step."""
-        tracker, previous = self._builder.tracker, self._builder.rows.previous
-        slots, states = self._settings.scene.slots, tracker.current.states
-        asked, clouds = states[tracker.external], dict(tracker.current.voxels)
-        is_moving = bool(kernels.any_moves(states, tracker.external))
-        is_noisy = is_moving and self._is_noisy
-        self._measure_spread(asked, step.t - self._last_look)
-        if is_noisy:  # a single twist is no base for what an obstacle does in a second; the mean of late is
-            asked[:, POSE:] = tracker.twists[tracker.external]
-        self._asked_states, self._asked_clouds = asked, clouds
-        obstacles = {slots[i].name: state for i, state in zip(tracker.external.tolist(), asked, strict=True)}
-        points = {name: clouds[i] for i, name in zip(tracker.external.tolist(), obstacles, strict=True) if i in clouds}
-        q, v, dv = step.q.copy(), previous.v.copy(), previous.dv.copy()
-        given, spread = self._given_targets(step), float(np.sqrt(self._spread)) if is_moving else 0.0
-        start = Snapshot(step.t, q, v, dv, self._driver.drive, obstacles, points, given, spread)
+        tracker, previous, t = self._builder.tracker, self._builder.rows.previous, step.t
+        which, clouds = tracker.external, tracker.current.voxels
+        asked = np.empty((len(which), STATE))
+        earlier, elapsed = self._asked_states, t - self._last_look
+        is_moving, rate = kernels.note_courses(tracker.current.states, which, earlier, elapsed, asked)
+        if 0 < len(which) == len(earlier) and elapsed > 0.0:
+            self._spread += 0.5 * ((rate if rate > _STEADY else 0.0) ** 2 - self._spread)
+        if is_noisy := is_moving and self._is_noisy:  # a single twist is no base for what an obstacle does in a second
+            asked[:, POSE:] = tracker.twists[which]
+        if which is not self._named:
+            slots = self._settings.scene.slots
+            self._named, self._names = which, tuple(slots[i].name for i in which.tolist())
+        points = _named(clouds, which, self._names) if clouds else {}
+        given = self._given_targets(step) if self._builder.gives_targets else {}
+        start = Snapshot(
+            t, step.q.copy(), previous.v.copy(), previous.dv.copy(), self._driver.drive, self._names, asked,
+            points, given, math.sqrt(self._spread) if is_moving else 0.0,
+        )  # fmt: skip
         self._number += 1
         self._question = Question(self._number, start, is_moving, is_noisy, self._looks)
-        self._looks += 1
-        self._last_look = step.t
+        self._asked_states, self._asked_clouds = asked, dict(clouds)
+        self._looks, self._last_look = self._looks + 1, t
         worker.ask(self._question)
 
     def _take(self, answer: Answer, t: float) -> None:
@@ -257,7 +285,8 @@ class Replanning:
         if question is None or answer.number != question.number:
             return
         self._question = None
-        if outcome is None or not is_sound(outcome, self._settings.scene.robot.model):
+        is_fine = answer.is_checked or (outcome is not None and is_sound(outcome, self._settings.scene.robot.model))
+        if outcome is None or not is_fine:
             detail = answer.failure or "what it answers has the wrong shape, or is not finite"
             self._no_plan = Reason.of(ReasonKind.NO_PLAN, "worker", detail=detail)
             return
@@ -281,6 +310,11 @@ class Replanning:
             if not np.array_equal(a, b):
                 given[task.settings.label] = target
         return given
+
+
+def _named(clouds: dict[int, Voxels], which: IntArray, names: tuple[str, ...]) -> dict[str, Voxels]:
+    """Return by name what is in those of some obstacles that are point clouds."""
+    return {name: clouds[i] for i, name in zip(which.tolist(), names, strict=True) if i in clouds}
 
 
 def _exclusion(tasks: Sequence[RowTask], law: Solver) -> Reason | None:

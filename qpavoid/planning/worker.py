@@ -22,10 +22,12 @@ from qpavoid.control.settings import ControlSettings
 from qpavoid.control.tasks import RowTask
 from qpavoid.control.tasks.com import Com
 from qpavoid.errors import ConfigError
-from qpavoid.planning.candidates import Candidates, Outcome
+from qpavoid.planning.candidates import Candidates, Outcome, is_sound
 from qpavoid.planning.forecast import Forecaster, Snapshot
 from qpavoid.planning.planner import Planner, PlannerSettings
 
+_NICE = 10
+"""By how much the process lets others go first, the control loop above all, where cores are scarce."""
 _SERVE = "from qpavoid.planning.worker import serve; serve()"
 """What the process runs."""
 
@@ -65,6 +67,8 @@ class Answer(NamedTuple):
     """Why."""
     no_paths: str = ""
     """Why no paths are planned, if they are wanted and there are none of this robot."""
+    is_checked: bool = False
+    """Whether the outcome was found to be sound already, by the thread that read it."""
 
 
 class Worker(Protocol):
@@ -126,7 +130,8 @@ class ProcessWorker:
         self.process = subprocess.Popen([sys.executable, "-c", _SERVE], **pipes)  # type: ignore[call-overload]
         self._messages, self._answers = SimpleQueue[Any](), SimpleQueue[Answer]()
         Thread(target=_write, args=(self.process.stdin, self._messages, self._answers), daemon=True).start()
-        Thread(target=_read, args=(self.process, self._answers), daemon=True).start()
+        model = parts.settings.scene.robot.model
+        Thread(target=_read, args=(self.process, self._answers, model), daemon=True).start()
         self._messages.put(parts)
         first = self._answers.get()
         if first.number < 0:
@@ -159,6 +164,8 @@ def make_worker(parts: Parts) -> Worker:
 
 def serve() -> None:
     """Answer questions from standard input on standard output until the end of it: what the process runs."""
+    if hasattr(os, "nice"):
+        os.nice(_NICE)
     source, answers = sys.stdin.buffer, os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)  # what else is printed must not get between the answers
     worker = InlineWorker(pickle.load(source))
@@ -194,13 +201,15 @@ def _write(pipe: BinaryIO, messages: SimpleQueue[Any], answers: SimpleQueue[Answ
         pass  # the reader says so
 
 
-def _read(process: subprocess.Popen[bytes], answers: SimpleQueue[Answer]) -> None:
-    """Read answers of a process until it is no more."""
+def _read(process: subprocess.Popen[bytes], answers: SimpleQueue[Answer], model: Any) -> None:
+    """Read and check answers of a process, of a robot's model, until it is no more; no step does either."""
     assert process.stdout is not None
     try:
         with process.stdout as pipe:
             while True:
-                answers.put(pickle.load(pipe))
+                answer: Answer = pickle.load(pipe)
+                is_fine = answer.outcome is not None and is_sound(answer.outcome, model)
+                answers.put(answer._replace(is_checked=is_fine))
     except Exception as error:  # a process that ends in the middle of an answer leaves anything
         answers.put(Answer(-1, None, f"the process has ended: {type(error).__name__}"))
     process.wait()

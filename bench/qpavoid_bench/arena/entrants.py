@@ -88,7 +88,7 @@ def _start_solver(solver: SolverConfig, changes: Mapping[str, Mapping[str, Any]]
     x = ScenarioConfig.model_validate({**scenario, "solver": solver.model_dump()})
     blocks = x.avoidance, x.limits, x.sensing, x.progress, world.contacts
     return Controller(
-        world.scene, world.tasks, make_solver(x.solver), x.dt, *blocks, planning=x.planning, dynamics=x.dynamics
+        world.scene, world.tasks, make_solver(x.solver), x.dt, *blocks, planning=x.planning_in_time, dynamics=x.dynamics
     )
 
 
