@@ -35,9 +35,9 @@ class _Structure(types.StructRef):  # type: ignore[misc]
 class _Memory(_Structure):
     """Type of a structure whose arrays stay the same: code looks into them, and counts no references to them.
 
-    A reference that is counted costs 5 ns where it is taken and where it is given up, which is half of the time of a
-    control step. The structure has one to each array, and its owner outlives every call: none of them is freed. So no
-    field may be assigned, and no kernel may return one to Python.
+    Each count is an atomic addition; together they took two fifths of a control step. The structure has a reference to
+    each array, and its owner outlives every call, so none of them is freed meanwhile: no field may be assigned, and no
+    kernel may return one to Python.
     """
 
 
