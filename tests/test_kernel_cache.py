@@ -34,8 +34,33 @@ KERNELS = {
                 result += double(x)
             return result
         """,
+    "large.py": """
+        from qpavoid.kernels.packing import compiled
+
+        @compiled
+        def large(x):
+            y = x
+            {}
+            return y
+        """.format("\n            ".join(f"y = {i}.0 + x / (y * y + 1.0)" for i in range(100))),
+    "callers.py": """
+        from qpavoid.kernels.large import large
+        from qpavoid.kernels.packing import compiled
+
+        @compiled
+        def small(x):
+            return large(x) - x
+
+        @compiled
+        def caller(x):
+            return small(x) + x
+
+        @compiled
+        def other_caller(x):
+            return small(x) + 2.0 * x
+        """,
 }
-"""Two kernels that are quickly compiled, of which one calls the other in another file."""
+"""Kernels that are quickly compiled, of which some call others in other files."""
 SCRIPT = """
 import numpy as np
 from qpavoid.kernels.cache import first_use
@@ -112,6 +137,40 @@ def test_cache_is_complete_once_a_controller_is_built():
     assert (FOLDER / "complete").exists() and any(FOLDER.glob("step.control_step-*.code"))
 
 
+CALL = """
+from qpavoid.kernels.callers import {0}
+from qpavoid.kernels.large import large
+
+print({0}(3.0) - large.py_func(3.0))
+print(sum({0}.stats.cache_hits.values()))
+"""
+
+
+def test_a_large_kernel_is_called_and_not_contained(site, tmp_path):
+    """So that it is compiled once; in a process that loads its caller it is loaded, too, or compiled."""
+    for hits in (0, 1):
+        difference, found = run(site, tmp_path, CALL.format("caller"))[0]
+        assert abs(difference) < 1e-9 and found == hits
+    (large,), (caller,) = tmp_path.glob("*/large.large-*"), tmp_path.glob("*/callers.caller-*")
+    assert caller.stat().st_size < 0.7 * large.stat().st_size
+    large.unlink()
+    difference, found = run(site, tmp_path, CALL.format("caller"))[0]
+    assert abs(difference) < 1e-9 and found == 1 and large.exists()
+
+
+def test_callers_know_a_large_kernel_that_another_process_compiled_after_them(site, tmp_path):
+    """Its name has another number there; so do new callers of a small kernel from disk, and later processes."""
+    run(site, tmp_path, CALL.format("caller"))
+    (large,) = tmp_path.glob("*/large.large-*")
+    before = large.read_bytes()
+    large.unlink()
+    run(site, tmp_path, SCRIPT + "from qpavoid.kernels.large import large\nlarge(3.0)")
+    assert large.read_bytes() != before
+    for name, hits in (("caller", 1), ("other_caller", 0), ("other_caller", 1)):
+        difference, found = run(site, tmp_path, CALL.format(name))[0]
+        assert abs(difference - 3.0 * (name == "other_caller")) < 1e-9 and found == hits
+
+
 def test_cache_that_is_unwritable_is_named_and_optional(site, tmp_path):
     nowhere = tmp_path / "file"
     nowhere.touch()
@@ -125,7 +184,7 @@ def test_cache_does_not_run_damaged_code(site, used, tmp_path):
     shutil.copytree(used[0], cache)
     for path in cache.glob("kernels-*/total.total-*.code"):
         content = path.read_bytes()
-        path.write_bytes(content[:5000] + b"\0" * 8 + content[5008:])
+        path.write_bytes(content[:5000] + bytes(255 - byte for byte in content[5000:5008]) + content[5008:])
     assert [run(site, cache)[0] for _ in range(2)] == [[20, 0], [20, 1]]
 
 

@@ -30,6 +30,8 @@ from numba.core.caching import CompileResultCacheImpl, FunctionCache
 from numba.core.serialize import dumps
 from numba.misc.appdirs import AppDirs
 
+from qpavoid.kernels import linking
+
 _MAX_FOLDERS = 8
 """Folders that are not deleted, those used last [-]: a few checkouts and versions of numba side by side, 5 MB each."""
 _DIGEST = 16
@@ -125,11 +127,21 @@ class _Locator:
 
 
 class _Implementation(CompileResultCacheImpl):  # type: ignore[misc]
-    """numba's serialisation of compiled functions, with the locator of this module."""
+    """numba's serialisation of compiled functions, with the locator of this module, and with what they call by name."""
 
     def __init__(self, function: Callable[..., Any]) -> None:
         self._lineno, self._locator = function.__code__.co_firstlineno, _Locator(function)
         self._filename_base = f"{function.__module__.rpartition('.')[2]}.{function.__qualname__}-{self._lineno}"
+
+    def reduce(self, code: Any) -> Any:
+        """Return what is written to disk."""
+        return linking.links_of(code), super().reduce(code)
+
+    def rebuild(self, target: Any, payload: Any) -> Any:
+        """Return what was written to disk as code that can be called."""
+        links, reduced = payload
+        linking.prepare(target, links)
+        return super().rebuild(target, reduced)
 
 
 class KernelCache(FunctionCache):  # type: ignore[misc]
@@ -140,6 +152,11 @@ class KernelCache(FunctionCache):  # type: ignore[misc]
     def __init__(self, function: Callable[..., Any]) -> None:
         super().__init__(function)
         self._cache_file = _Files(FOLDER, self._impl.filename_base)
+
+    def save_overload(self, signature: Any, code: Any) -> None:
+        """Write a kernel that was compiled, before its caller is: large ones are not linked into that."""
+        linking.take_out_of_callers(code, self._py_func)
+        super().save_overload(signature, code)
 
 
 class FirstUse:
