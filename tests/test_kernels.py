@@ -1,8 +1,10 @@
 """Array work of a control step: by plain definitions, by hand, and without the compiler."""
 
+import gc
 import os
 import subprocess
 import sys
+import weakref
 
 import numpy as np
 import oracle_kernels as oracle
@@ -11,7 +13,9 @@ import pytest
 from conftest import BOX, CAPSULE, CYLINDER, SPHERE, lay_out_step, make_layout, random_q, random_scene
 
 from qpavoid import kernels
+from qpavoid.control.estimates import MeasuredStates
 from qpavoid.control.obstacle_states import ObstacleStates
+from qpavoid.control.trajectories import TrajectoryBatch
 from qpavoid.kernels.packing import compiled
 
 SEEDS = range(8)
@@ -605,3 +609,24 @@ def test_ramp_keeps_to_the_largest_change():
         expected = [[min(0.1 * (i + 1), 0.35), -0.1, 5.0] for i in range(4 if meets else 6)]
         np.testing.assert_allclose(found, expected, rtol=0, atol=1e-15)
         assert len(follow(np.zeros(3), constant[:0], np.ones(3), meets)) == 0
+
+
+def test_a_structure_keeps_its_arrays_through_all_calls_and_gives_them_back_with_itself():
+    """Code that looks into the arrays of a structure neither frees one of them nor holds on to it."""
+    measured = MeasuredStates(TrajectoryBatch({}).pieces, 3, dt=0.01)
+    fields = {name: getattr(measured.arrays, name).copy() for name in ("states", "last", "updates", "stamps", "fits")}
+    owned = {name: weakref.ref(array) for name, array in fields.items()}
+    packed, which = kernels.pack(measured.arrays._replace(**fields)), np.arange(3)
+    del fields
+    gc.collect()
+    row = np.r_[np.eye(3).ravel(), 1.0, 2.0, 3.0, np.zeros(6)]
+    counts = []
+    for k in range(50):
+        assert kernels.check_updates(packed, which, np.tile(row, (3, 1)), np.zeros(3, np.intp)) == 0
+        assert kernels.observe(packed, 0.01 * k, which, np.zeros(3, np.intp), np.full(3, 0.01 * k), which) == (0, 0)
+        counts.append([sys.getrefcount(array()) for array in owned.values()])
+    assert counts[0] == counts[-1]
+    assert (owned["states"]() == row).all()
+    del packed
+    gc.collect()
+    assert [name for name, array in owned.items() if array() is not None] == []

@@ -50,7 +50,7 @@ def fit_turn(fit: Array, velocity: Array, interval: float, turn: Array) -> None:
     if not 0.0 < interval <= _SPAN or fit[7] == 0.0:  # NaN, too
         fit[:], fit[:3], fit[7] = 0.0, velocity[:3], 1.0
         return
-    _turn_on(v, a, interval)
+    _turn_on(v, a, interval, turn)
     n = fit[7] + 1.0
     fade = _MEMORY / (_MEMORY + interval)
     follow, bend = max(1.0 - fade * fade, (4.0 * n - 2.0) / (n * n + n)), max((1.0 - fade) ** 2, 6.0 / (n * n + n))
@@ -86,9 +86,8 @@ def _speed_and_turn(v: Array, a: Array, turn: Array) -> tuple[float, float]:
 
 
 @compiled
-def _turn_on(v: Array, a: Array, t: float) -> None:
-    """Bring velocity and acceleration (3,) to a later time, in place: both turn at the rate at which v does."""
-    turn = np.empty(3)
+def _turn_on(v: Array, a: Array, t: float, turn: Array) -> None:
+    """Bring velocity and acceleration (3,) to a later time, in place: both turn at the rate at which v does, `turn`."""
     speed, across = _speed_and_turn(v, a, turn)
     if across == 0.0:
         for c in range(3):
