@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from qpavoid.kernels.gjk import MIN_CORE_DISTANCE, core_distance
-from qpavoid.kernels.packing import compiled, inlined
+from qpavoid.kernels.packing import compiled, inlined_uncounted, uncounted
 from qpavoid.kernels.support import BOX, HALF_SPACE, Shapes, support
 from qpavoid.problem import Array, IntArray
 
@@ -51,8 +51,18 @@ def compute_distances(
         Number of these.
     """
     simplex, between = np.empty((4, 10)), np.empty(12)
+    return _compute_pairs(shapes, poses, bodies, method, pairs, guesses, simplex, between, results, meeting)
+
+
+@uncounted
+def _compute_pairs(
+    shapes: Shapes, poses: Array, bodies: IntArray, method: IntArray, pairs: IntArray, guesses: Array, simplex: Array,
+    between: Array, results: Array, meeting: IntArray,
+) -> int:  # fmt: skip
+    """Do the work of `compute_distances`, with its scratch."""
     count = 0
-    for k in pairs:
+    for n in range(len(pairs)):
+        k = pairs[n]
         how, i, j = method[k], bodies[k, 0], bodies[k, 1]
         if how != BY_COAL and not pair_distance(shapes, poses, i, j, how, guesses[k], simplex, between, results[k]):
             meeting[count] = k
@@ -60,7 +70,7 @@ def compute_distances(
     return count
 
 
-@inlined
+@inlined_uncounted
 def pair_distance(
     shapes: Shapes,
     poses: Array,
@@ -75,7 +85,7 @@ def pair_distance(
     """Update the result of one pair, see `compute_distances`; return False where cores meet, or coal has to do it."""
     is_apart = False
     if how == CLOSED_FORM:
-        is_apart = _closed_form(shapes, poses, i, j, result)
+        is_apart = _closed_form(shapes, poses, i, j, between, result)
     elif how == BY_GJK:
         is_apart = core_distance(shapes, poses, i, j, guess, simplex, between, result)
     elif how == TO_HALF_SPACE:
@@ -85,7 +95,7 @@ def pair_distance(
     return is_apart
 
 
-@inlined
+@inlined_uncounted
 def _add_radii(r: float, s: float, result: Array) -> None:
     """Turn the result of two cores into that of the bodies with these radii around them."""
     result[0] -= r + s
@@ -94,15 +104,15 @@ def _add_radii(r: float, s: float, result: Array) -> None:
         result[7 + c] -= s * result[1 + c]
 
 
-@inlined
-def _closed_form(shapes: Shapes, poses: Array, i: int, j: int, result: Array) -> bool:
+@inlined_uncounted
+def _closed_form(shapes: Shapes, poses: Array, i: int, j: int, between: Array, result: Array) -> bool:
     """Write the result of two cores, points, segments or one of them a box; return False where they meet."""
-    a, b = result[4:7], result[7:10]
+    a, b, p, u = result[4:7], result[7:10], between[:3], between[3:6]
     core = shapes.core
     if shapes.kind[i] == BOX:
-        _segment_and_box(poses[j], core[j, 3], poses[i], core[i], b, a)
+        _segment_and_box(poses[j], core[j, 3], poses[i], core[i], p, u, b, a)
     elif shapes.kind[j] == BOX:
-        _segment_and_box(poses[i], core[i, 3], poses[j], core[j], a, b)
+        _segment_and_box(poses[i], core[i, 3], poses[j], core[j], p, u, a, b)
     else:
         _two_segments(poses[i], core[i, 3], poses[j], core[j, 3], a, b)
     x, y, z = b[0] - a[0], b[1] - a[1], b[2] - a[2]
@@ -113,7 +123,7 @@ def _closed_form(shapes: Shapes, poses: Array, i: int, j: int, result: Array) ->
     return True
 
 
-@inlined
+@inlined_uncounted
 def _to_half_space(shapes: Shapes, poses: Array, i: int, j: int, guess: Array, result: Array) -> bool:
     """Write the result of a core and a half-space below the plane z = 0 of its pose; return False at NaN.
 
@@ -140,13 +150,13 @@ def _to_half_space(shapes: Shapes, poses: Array, i: int, j: int, guess: Array, r
     return bool(abs(distance) < np.inf)
 
 
-@compiled
+@uncounted
 def _clamp(x: float, limit: float) -> float:
     """Return x within ±limit."""
     return min(max(x, -limit), limit)
 
 
-@compiled
+@uncounted
 def _two_segments(one: Array, l1: float, two: Array, l2: float, a: Array, b: Array) -> None:
     """Write the closest points of two segments along the z axes of their poses.
 
@@ -180,8 +190,10 @@ def _two_segments(one: Array, l1: float, two: Array, l2: float, a: Array, b: Arr
         b[c] = two[9 + c] + t * two[6 + c]
 
 
-@compiled
-def _segment_and_box(segment: Array, half: float, box: Array, core: Array, a: Array, b: Array) -> None:
+@uncounted
+def _segment_and_box(
+    segment: Array, half: float, box: Array, core: Array, p: Array, u: Array, a: Array, b: Array
+) -> None:
     """Write the closest points of a segment along the z axis of its pose, and of a box.
 
     The squared distance of the box from a point on the segment is convex along it, and its slope is linear between the
@@ -192,10 +204,11 @@ def _segment_and_box(segment: Array, half: float, box: Array, core: Array, a: Ar
         half: half of its length [m].
         box: pose of the box (12,).
         core: radius and half-sizes of the box (4,) [m].
+        p: out (3,): centre of the segment in the frame of the box [m].
+        u: out (3,): its direction in that frame.
         a: out (3,): point on the segment [m].
         b: out (3,): point of the box [m].
     """
-    p, u = np.empty(3), np.empty(3)
     for r in range(3):
         p[r], u[r] = 0.0, 0.0
         for c in range(3):
@@ -212,7 +225,7 @@ def _segment_and_box(segment: Array, half: float, box: Array, core: Array, a: Ar
             b[c] += inside * box[3 * r + c]
 
 
-@compiled
+@uncounted
 def _closest_place(p: Array, u: Array, core: Array, half: float, last: bool) -> float:
     """Compute the first, or last, s of p + s u, |s| <= half, that is closest to a box at the origin [m].
 
@@ -243,7 +256,7 @@ def _closest_place(p: Array, u: Array, core: Array, half: float, last: bool) -> 
     return low - at_low * (high - low) / (at_high - at_low) if at_high > at_low else low
 
 
-@compiled
+@uncounted
 def _slope(p: Array, u: Array, core: Array, s: float) -> float:
     """Compute d/ds of half the squared distance of a box from p + s u [m]."""
     slope = 0.0

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from qpavoid.kernels.packing import compiled, inlined
+from qpavoid.kernels.packing import inlined_uncounted, uncounted
 from qpavoid.kernels.support import Shapes, any_point, support
 from qpavoid.problem import Array
 
@@ -30,7 +30,7 @@ _MAX_ITERATIONS = 60
 """Of one search: polytopes need 11 at most, curved shapes 10 to 20, and more where one is much larger or they touch."""
 
 
-@inlined
+@inlined_uncounted
 def core_distance(
     shapes: Shapes, poses: Array, i: int, j: int, guess: Array, simplex: Array, between: Array, result: Array
 ) -> bool:
@@ -86,7 +86,7 @@ def core_distance(
     return False
 
 
-@inlined
+@inlined_uncounted
 def _relative_pose(poses: Array, i: int, j: int, between: Array) -> None:
     """Write the pose of body j in the frame of body i."""
     px, py, pz = poses[j, 9] - poses[i, 9], poses[j, 10] - poses[i, 10], poses[j, 11] - poses[i, 11]
@@ -97,7 +97,7 @@ def _relative_pose(poses: Array, i: int, j: int, between: Array) -> None:
             between[3 * c + r] = x * poses[j, 3 * c] + y * poses[j, 3 * c + 1] + z * poses[j, 3 * c + 2]
 
 
-@inlined
+@inlined_uncounted
 def _extend(
     shapes: Shapes, i: int, j: int, u: int, v: int, between: Array, simplex: Array, n: int, x: float, y: float, z: float
 ) -> tuple[int, int]:
@@ -113,7 +113,7 @@ def _extend(
     return u, v
 
 
-@inlined
+@inlined_uncounted
 def _subtract(simplex: Array, n: int, between: Array) -> None:
     """Write a - b of row n of the simplex, in the axes of a."""
     x, y, z = simplex[n, 6], simplex[n, 7], simplex[n, 8]
@@ -122,7 +122,7 @@ def _subtract(simplex: Array, n: int, between: Array) -> None:
         simplex[n, c] = simplex[n, 3 + c] - b
 
 
-@inlined
+@inlined_uncounted
 def _restart(guess: Array, count: int, between: Array, simplex: Array) -> None:
     """Write the simplex with the points where the last search ended."""
     for k in range(count):
@@ -131,7 +131,7 @@ def _restart(guess: Array, count: int, between: Array, simplex: Array) -> None:
         _subtract(simplex, k, between)
 
 
-@inlined
+@inlined_uncounted
 def _save(guess: Array, count: int, u: int, v: int, simplex: Array) -> None:
     """Write what the next search starts from."""
     guess[0], guess[1], guess[2] = count, u, v
@@ -140,7 +140,7 @@ def _save(guess: Array, count: int, u: int, v: int, simplex: Array) -> None:
             guess[4 + 6 * k + c] = simplex[k, 3 + c]
 
 
-@inlined
+@inlined_uncounted
 def _reduce(simplex: Array, count: int) -> tuple[int, float, float, float]:
     """Drop the points without a weight; return how many are left, and their weighted mean."""
     n, x, y, z = 0, 0.0, 0.0, 0.0
@@ -155,7 +155,7 @@ def _reduce(simplex: Array, count: int) -> tuple[int, float, float, float]:
     return n, x, y, z
 
 
-@inlined
+@inlined_uncounted
 def _upright(s: Array, count: int, x: float, y: float, z: float) -> tuple[float, float, float]:
     """Return the mean of points with its component along their edge, or in their plane, taken off.
 
@@ -180,7 +180,7 @@ def _upright(s: Array, count: int, x: float, y: float, z: float) -> tuple[float,
     return x, y, z
 
 
-@inlined
+@inlined_uncounted
 def _extent(s: Array, n: int) -> float:
     """Return how large the coordinates of a point of the simplex, and of what it was made of, are [m]."""
     extent = 0.0
@@ -189,7 +189,7 @@ def _extent(s: Array, n: int) -> float:
     return extent
 
 
-@inlined
+@inlined_uncounted
 def _write(
     poses: Array, i: int, simplex: Array, count: int, length: float, x: float, y: float, z: float, result: Array
 ) -> None:
@@ -205,7 +205,7 @@ def _write(
         result[1 + r], result[4 + r], result[7 + r] = normal, point, point + length * normal
 
 
-@compiled
+@uncounted
 def _closest(s: Array, count: int) -> float:
     """Write the weights of the point of a simplex that is closest to the origin; return its squared distance.
 
@@ -229,7 +229,7 @@ def _closest(s: Array, count: int) -> float:
     return best if best < np.inf else 0.0
 
 
-@inlined
+@inlined_uncounted
 def _is_beyond(s: Array, i: int, j: int, k: int, other: int) -> bool:
     """Return whether the origin is not on the side of a face on which the fourth point is."""
     ux, uy, uz = s[j, 0] - s[i, 0], s[j, 1] - s[i, 1], s[j, 2] - s[i, 2]
@@ -240,7 +240,7 @@ def _is_beyond(s: Array, i: int, j: int, k: int, other: int) -> bool:
     return not origin * there > 0.0
 
 
-@inlined
+@inlined_uncounted
 def _segment(s: Array, i: int, j: int) -> tuple[float, float, float]:
     """Return the squared distance of a segment from the origin, and the weights of its ends."""
     ux, uy, uz = s[j, 0] - s[i, 0], s[j, 1] - s[i, 1], s[j, 2] - s[i, 2]
@@ -251,7 +251,7 @@ def _segment(s: Array, i: int, j: int) -> tuple[float, float, float]:
     return x * x + y * y + z * z, 1.0 - t, t
 
 
-@inlined
+@inlined_uncounted
 def _triangle(s: Array, i: int, j: int, k: int) -> tuple[float, float, float, float]:
     """Return the squared distance of a triangle from the origin, and the weights of its corners.
 

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from qpavoid.kernels.packing import inlined
+from qpavoid.kernels.packing import inlined_uncounted
 from qpavoid.problem import Array, IntArray
 
 POINT, SEGMENT, BOX, CYLINDER, CONE, ELLIPSOID, HULL, HALF_SPACE, OTHER = range(9)
@@ -37,7 +37,7 @@ class Shapes(NamedTuple):
     """(e,) numbers of the vertices that edges lead to."""
 
 
-@inlined
+@inlined_uncounted
 def support(shapes: Shapes, i: int, start: int, x: float, y: float, z: float) -> tuple[int, float, float, float]:
     """Find the point of a core that is farthest along a direction.
 
@@ -73,7 +73,7 @@ def support(shapes: Shapes, i: int, start: int, x: float, y: float, z: float) ->
     return start, a * x / radial, a * y / radial, height
 
 
-@inlined
+@inlined_uncounted
 def any_point(shapes: Shapes, i: int) -> tuple[float, float, float]:
     """Return a point of a core: its centre, but a corner of a hull, which may be anywhere in its frame [m]."""
     if shapes.kind[i] != HULL:
@@ -82,7 +82,7 @@ def any_point(shapes: Shapes, i: int) -> tuple[float, float, float]:
     return shapes.vertices[at, 0], shapes.vertices[at, 1], shapes.vertices[at, 2]
 
 
-@inlined
+@inlined_uncounted
 def farthest_vertex(shapes: Shapes, low: int, high: int, start: int, x: float, y: float, z: float) -> int:
     """Find the vertex of a hull, of those from `low` to before `high`, that is farthest along a direction."""
     V = shapes.vertices
@@ -105,7 +105,7 @@ def farthest_vertex(shapes: Shapes, low: int, high: int, start: int, x: float, y
     return at
 
 
-@inlined
+@inlined_uncounted
 def _side(x: float) -> float:
     """Return the sign of a component of a unit direction; 0 where it counts as none."""
     return 1.0 if x > _TIE else (-1.0 if x < -_TIE else 0.0)
