@@ -95,6 +95,11 @@ class ClosedLoop:
                 look.travel,
             ),
         )
+        none = 0, 0  # steps
+        self._run = kernels.direct(
+            run_periods, self._calls, rows.packed, tracker.packed, self._watch, ahead, rows.q, setting, self.periods,
+            *none,
+        )  # fmt: skip
 
     @staticmethod
     def suits(settings: ControlSettings, builder: ProblemBuilder, tasks: tuple[RowTask, ...]) -> bool:
@@ -127,7 +132,7 @@ class ClosedLoop:
         while done < most and self.last is None:
             begin, check = done, done + arbiter.progress.steps_to_check
             end = min(most, check)
-            done = run_periods(
+            done = self._run(
                 calls, rows.packed, tracker.packed, self._watch, self._ahead, rows.q, setting, log, begin, end
             )  # fmt: skip
             if done == begin:
