@@ -9,7 +9,7 @@ import numpy as np
 from qpavoid.kernels.approach import PATH_PERIOD
 from qpavoid.kernels.arguments import take_usual
 from qpavoid.kernels.clearance import leaves_position_limits
-from qpavoid.kernels.look_ahead import LOOKED, LookingAhead, stop_duration, write_straight_path
+from qpavoid.kernels.look_ahead import LOOKED, LookAhead, LookAheadCalls, stop_duration, write_straight_path
 from qpavoid.kernels.obstacles import Pieces
 from qpavoid.kernels.packing import compiled, exact, released
 from qpavoid.kernels.rows import alpha, beta
@@ -89,7 +89,10 @@ def run_periods(
     x: Any,
     obstacles: Any,
     approach: Any,
-    ahead: LookingAhead,
+    look_calls: LookAheadCalls,
+    look: LookAhead,
+    kinematics: Any,
+    later: Any,
     q: Array,
     s: LoopSetting,
     log: Periods,
@@ -103,7 +106,10 @@ def run_periods(
         x: memory of the step, see `RowLayout`.
         obstacles: memory of their states, see `ObstacleArrays`.
         approach: memory of their paths, see `ApproachArrays`.
-        ahead: memory of the stop look-ahead.
+        look_calls: kernels of the stop look-ahead.
+        look: memory of that.
+        kinematics: the same, see `KinematicsArrays`.
+        later: the same, see `DistanceArrays`.
         q: configuration that the memory of the step has (nq,).
         s: see `LoopSetting`.
         log: record; t, and the first q, are given.
@@ -125,7 +131,13 @@ def run_periods(
         if s.observes:
             moving = call_for_truth(calls.follow_trajectories, (obstacles, x.distances, t, s.placed))
         code = call_for_code(calls.control_step, (x, q, s.influence_distance, moving, True, False))
-        if code != SETTLED and not (code == UNCLEAR and s.looks and stays_clear(calls, x, obstacles, ahead, q, s)):
+        if code == UNCLEAR and s.looks and can_look_along(calls, x, obstacles, look, later, q, s):
+            code = call_for_code(
+                calls.look_along, (look_calls, look, x.distances, kinematics, later, q, look.times, look.travel)
+            )
+            if code != LOOKED or not look.result[0] >= 0.0:
+                return k
+        elif code != SETTLED:
             return k
         if s.watches:
             point = int(np.floor(t / PATH_PERIOD))
@@ -149,18 +161,20 @@ def run_periods(
 
 
 @compiled
-def stays_clear(calls: LoopCalls, x: Any, obstacles: Any, ahead: LookingAhead, q: Array, s: LoopSetting) -> bool:
-    """Return whether the velocity of a step whose bounds show nothing is clear, see `safety.braking`; False: or not.
+def can_look_along(
+    calls: LoopCalls, x: Any, obstacles: Any, look: LookAhead, later: Any, q: Array, s: LoopSetting
+) -> bool:
+    """Write the path that a step of which bounds show nothing leads along; return whether kernels may look along it.
 
     Args:
         calls: kernels.
         x: memory of the step, see `RowLayout`.
         obstacles: memory of their states, see `ObstacleArrays`.
-        ahead: memory of the stop look-ahead.
+        look: memory of the stop look-ahead.
+        later: its distances; obstacles are placed where they are at the end of the control period.
         q: configuration (nq,).
         s: see `LoopSetting`.
     """
-    look = ahead.memory
     for j in range(len(q)):
         if not x.lower[j] <= x.v[j] <= x.upper[j]:
             return False
@@ -169,13 +183,9 @@ def stays_clear(calls: LoopCalls, x: Any, obstacles: Any, ahead: LookingAhead, q
         return False
     look.allowance[:], look.states[:] = 0.0, obstacles.states
     call(calls.extrapolate_states, (look.states, look.durations))
-    call_for_placing(calls.place_obstacles, (ahead.distances, s.placed, look.states, obstacles.margin))
+    call_for_placing(calls.place_obstacles, (later, s.placed, look.states, obstacles.margin))
     write_straight_path(look, x.v, duration)
-    code = call_for_code(
-        calls.look_along,
-        (ahead.calls, look, x.distances, ahead.kinematics, ahead.distances, q, look.times, look.travel),
-    )
-    return bool(code == LOOKED and look.result[0] >= 0.0)
+    return True
 
 
 @compiled

@@ -66,17 +66,6 @@ class LookAhead(NamedTuple):
     """That is required of pairs, a little less [m]."""
 
 
-class LookingAhead(NamedTuple):
-    """What the stop look-ahead has of its own."""
-
-    calls: LookAheadCalls
-    memory: LookAhead
-    kinematics: Any
-    """See `KinematicsArrays`."""
-    distances: Any
-    """See `DistanceArrays`."""
-
-
 @exact
 def stop_duration(v: Array, acceleration: Array, dt: float) -> float:
     """Compute the time in which v (nv,) leads as far as one control period of it and the stop that follows [s].

@@ -19,7 +19,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from math import isnan
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import pinocchio as pin
@@ -30,7 +30,7 @@ from qpavoid.control.distances import DistanceQuery
 from qpavoid.control.obstacles import ObstacleTracker
 from qpavoid.control.settings import ControlSettings
 from qpavoid.kernels import LOOKED, TOLERANCE, least_margin, speed_to_stop
-from qpavoid.kernels.look_ahead import MAX_APPROACH_IN_VIOLATION, MAX_MARGIN, MIN_SPEED, LookingAhead
+from qpavoid.kernels.look_ahead import MAX_APPROACH_IN_VIOLATION, MAX_MARGIN, MIN_SPEED
 from qpavoid.kernels.structures import address
 from qpavoid.model.kinematics import ForwardKinematics
 from qpavoid.model.sample import STATE
@@ -131,12 +131,12 @@ class BrakingCheck:
             and not (self._has_jerks or self._budget.is_limited)
         )
         """Whether kernels look along a path, but for pairs whose cores meet."""
-        self.ahead = self._lay_out(len(scene.slots), len(scene.pairs))
-        """Memory of that."""
-        self._allowance = self.ahead.memory.allowance
+        self.look_arguments = self._lay_out(len(scene.slots), len(scene.pairs))
+        """Kernels of that, its memory, kinematics and distances."""
+        self._allowance = self.look_arguments[1].allowance
 
-    def _lay_out(self, obstacles: int, pairs: int) -> LookingAhead:
-        """Lay out the memory of the kernels, for so many obstacles and pairs."""
+    def _lay_out(self, obstacles: int, pairs: int) -> tuple[kernels.LookAheadCalls, kernels.LookAhead, Any, Any]:
+        """Lay out what the kernels take, for so many obstacles and pairs."""
         query, kinematics, model = self._query.packed, self._kinematics, self._model
         memory = kernels.LookAhead(
             acceleration=self._bounds.acceleration,
@@ -159,7 +159,7 @@ class BrakingCheck:
             place_bodies=address(kernels.place_bodies, query, kinematics.joint_poses),
             near_pairs=address(kernels.near_pairs, query, np.inf),
         )
-        return LookingAhead(calls, memory, kinematics.packed, query)
+        return calls, memory, kinematics.packed, query
 
     def warm_up(self, q: Array) -> None:
         """Evaluate a standstill at q (nq,), where a control step has been: no later one waits for the kernels."""
@@ -224,9 +224,9 @@ class BrakingCheck:
         within one of those is of second order in it, as it was not too near at either end. A curved path may turn back
         in between, and before its end: there the least margin is refined.
         """
-        path, now, ahead = self._path(q, v), self._now, self.ahead
+        path, now = self._path(q, v), self._now
         if self.is_compiled:
-            calls, look, kinematics, later = ahead
+            calls, look, kinematics, later = self.look_arguments
             if kernels.look_along(calls, look, now.packed, kinematics, later, q, path.times, path.travel) == LOOKED:
                 margin, pair, distance = look.result.tolist()
                 return _Least(margin, int(pair), distance)

@@ -68,8 +68,8 @@ class ClosedLoop:
         """Record of the last `run`."""
         self.last: Solution | None = None
         """Solution of its last step, where there is more to say of it than its velocity."""
-        self._watch, ahead = watch.packed, arbiter.braking.ahead
-        self._ahead, look = ahead, ahead.memory
+        self._watch, self._look = watch.packed, arbiter.braking.look_arguments
+        look_calls, look, kinematics, later = self._look
         setting = self._setting()
         self._calls = LoopCalls(
             sample_pieces=address(kernels.sample_pieces, setting.targets, 0.0, rows.targets),
@@ -81,24 +81,12 @@ class ClosedLoop:
             comes_near=address(kernels.comes_near, self._watch, rows.query.packed, rows.v, _NONE, _NONE),
             extrapolate_states=address(kernels.extrapolate_states, look.states, look.durations),
             place_obstacles=address(
-                kernels.place_obstacles, ahead.distances, setting.placed, look.states, tracker.current.margin
+                kernels.place_obstacles, later, setting.placed, look.states, tracker.current.margin
             ),
             look_along=address(
-                kernels.look_along,
-                ahead.calls,
-                look,
-                rows.query.packed,
-                ahead.kinematics,
-                ahead.distances,
-                rows.q,
-                look.times,
+                kernels.look_along, look_calls, look, rows.query.packed, kinematics, later, rows.q, look.times,
                 look.travel,
             ),
-        )
-        none = 0, 0  # steps
-        self._run = kernels.direct(
-            run_periods, self._calls, rows.packed, tracker.packed, self._watch, ahead, rows.q, setting, self.periods,
-            *none,
         )  # fmt: skip
 
     @staticmethod
@@ -132,8 +120,8 @@ class ClosedLoop:
         while done < most and self.last is None:
             begin, check = done, done + arbiter.progress.steps_to_check
             end = min(most, check)
-            done = self._run(
-                calls, rows.packed, tracker.packed, self._watch, self._ahead, rows.q, setting, log, begin, end
+            done = run_periods(
+                calls, rows.packed, tracker.packed, self._watch, *self._look, rows.q, setting, log, begin, end
             )  # fmt: skip
             if done == begin:
                 break
