@@ -54,6 +54,18 @@ def test_the_log_of_a_run_is_that_of_single_steps(scenario):
     assert run.meta["events"] == steps.meta["events"]
 
 
+def test_steps_that_look_ahead_are_taken_in_compiled_code(monkeypatch):
+    scenario, taken, tick = shortened("panda_line", 12.0, backup=False), [], Controller.tick
+
+    def counted(controller, *arguments, **options):
+        taken.append(arguments)
+        return tick(controller, *arguments, **options)
+
+    monkeypatch.setattr(Controller, "tick", counted)
+    simulate(scenario)
+    assert len(taken) < 10  # those that build and begin the run; 69 steps look ahead
+
+
 def test_plain_steps_end_where_something_else_decides():
     scenario = load_scenario("panda_line")
     controller, q = Controller.from_scenario(scenario)

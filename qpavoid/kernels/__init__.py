@@ -32,6 +32,15 @@ from qpavoid.kernels.dynamics_rows import slow_rows
 from qpavoid.kernels.estimates import ObstacleArrays, check_updates, follow_trajectories, observe
 from qpavoid.kernels.kinematics import KinematicsArrays, update_kinematics
 from qpavoid.kernels.layout import SUMMARY, RowLayout
+from qpavoid.kernels.look_ahead import (
+    LOOKED,
+    LookAhead,
+    LookAheadCalls,
+    look_along,
+    next_pose_time,
+    stop_duration,
+    write_displacement,
+)
 from qpavoid.kernels.margins import distances_of, least_margin
 from qpavoid.kernels.near_pairs import DistanceArrays, near_pairs, place_bodies, place_obstacles
 from qpavoid.kernels.obstacles import Pieces, check_states, sample_pieces
@@ -72,6 +81,7 @@ from qpavoid.kernels.tracking_law import tracking_law
 from qpavoid.kernels.voxels import select_voxels, voxels_within
 
 __all__ = [
+    "LOOKED",
     "ROWS_PER_POINT",
     "SETTLED",
     "SUMMARY",
@@ -83,6 +93,8 @@ __all__ = [
     "DynamicsArrays",
     "FrameTargets",
     "KinematicsArrays",
+    "LookAhead",
+    "LookAheadCalls",
     "ObstacleArrays",
     "OwnBodies",
     "Pieces",
@@ -128,11 +140,13 @@ __all__ = [
     "joint_speeds",
     "least_margin",
     "leaves_position_limits",
+    "look_along",
     "make_orthonormal",
     "mark_own_pixels",
     "max_clearance_velocity",
     "minimize",
     "near_pairs",
+    "next_pose_time",
     "note_courses",
     "observe",
     "offset_after_step",
@@ -161,6 +175,7 @@ __all__ = [
     "speed_to_stop",
     "standing_step",
     "standing_torques",
+    "stop_duration",
     "stop_velocity",
     "strays",
     "surprise",
@@ -173,5 +188,6 @@ __all__ = [
     "violation",
     "voxels_within",
     "with_impulses",
+    "write_displacement",
     "write_path_point",
 ]

@@ -8,11 +8,13 @@ import numpy as np
 
 from qpavoid.kernels.approach import PATH_PERIOD
 from qpavoid.kernels.arguments import take_usual
+from qpavoid.kernels.clearance import leaves_position_limits
+from qpavoid.kernels.look_ahead import LOOKED, LookAhead, LookAheadCalls, stop_duration, write_straight_path
 from qpavoid.kernels.obstacles import Pieces
 from qpavoid.kernels.packing import compiled, exact, released
 from qpavoid.kernels.rows import alpha, beta
-from qpavoid.kernels.step import SETTLED
-from qpavoid.kernels.structures import call, call_for_code, call_for_nearness, call_for_truth
+from qpavoid.kernels.step import SETTLED, UNCLEAR
+from qpavoid.kernels.structures import call, call_for_code, call_for_nearness, call_for_placing, call_for_truth
 from qpavoid.problem import Array, IntArray
 
 
@@ -24,6 +26,9 @@ class LoopCalls(NamedTuple):
     control_step: Any
     extend_paths: Any
     comes_near: Any
+    extrapolate_states: Any
+    place_obstacles: Any
+    look_along: Any
 
 
 class LoopSetting(NamedTuple):
@@ -49,6 +54,8 @@ class LoopSetting(NamedTuple):
     """Whether any obstacle may move."""
     is_moving: bool
     """Whether any counts as moving though none does: for its margin."""
+    looks: bool
+    """Whether kernels look ahead where bounds do not show that a velocity is clear."""
     watches: bool
     """Whether backup trajectories are needed where one comes near."""
     largest_velocity: float
@@ -82,6 +89,10 @@ def run_periods(
     x: Any,
     obstacles: Any,
     approach: Any,
+    look_calls: LookAheadCalls,
+    look: LookAhead,
+    kinematics: Any,
+    later: Any,
     q: Array,
     s: LoopSetting,
     log: Periods,
@@ -95,6 +106,10 @@ def run_periods(
         x: memory of the step, see `RowLayout`.
         obstacles: memory of their states, see `ObstacleArrays`.
         approach: memory of their paths, see `ApproachArrays`.
+        look_calls: kernels of the stop look-ahead.
+        look: memory of that.
+        kinematics: the same, see `KinematicsArrays`.
+        later: the same, see `DistanceArrays`.
         q: configuration that the memory of the step has (nq,).
         s: see `LoopSetting`.
         log: record; t, and the first q, are given.
@@ -115,7 +130,14 @@ def run_periods(
             return k
         if s.observes:
             moving = call_for_truth(calls.follow_trajectories, (obstacles, x.distances, t, s.placed))
-        if call_for_code(calls.control_step, (x, q, s.influence_distance, moving, True, False)) != SETTLED:
+        code = call_for_code(calls.control_step, (x, q, s.influence_distance, moving, True, False))
+        if code == UNCLEAR and s.looks and can_look_along(calls, x, obstacles, look, later, q, s):
+            code = call_for_code(
+                calls.look_along, (look_calls, look, x.distances, kinematics, later, q, look.times, look.travel)
+            )
+            if code != LOOKED or not look.result[0] >= 0.0:
+                return k
+        elif code != SETTLED:
             return k
         if s.watches:
             point = int(np.floor(t / PATH_PERIOD))
@@ -136,6 +158,34 @@ def run_periods(
         x.v_prev[:] = x.v
         integrate(log.q[k], x.v, s.dt, log.q[k + 1])
     return last
+
+
+@compiled
+def can_look_along(
+    calls: LoopCalls, x: Any, obstacles: Any, look: LookAhead, later: Any, q: Array, s: LoopSetting
+) -> bool:
+    """Write the path that a step of which bounds show nothing leads along; return whether kernels may look along it.
+
+    Args:
+        calls: kernels.
+        x: memory of the step, see `RowLayout`.
+        obstacles: memory of their states, see `ObstacleArrays`.
+        look: memory of the stop look-ahead.
+        later: its distances; obstacles are placed where they are at the end of the control period.
+        q: configuration (nq,).
+        s: see `LoopSetting`.
+    """
+    for j in range(len(q)):
+        if not x.lower[j] <= x.v[j] <= x.upper[j]:
+            return False
+    duration = stop_duration(x.v, look.acceleration, s.dt)
+    if duration > s.dt and leaves_position_limits(x, q, x.v, duration):
+        return False
+    look.allowance[:], look.states[:] = 0.0, obstacles.states
+    call(calls.extrapolate_states, (look.states, look.durations))
+    call_for_placing(calls.place_obstacles, (later, s.placed, look.states, obstacles.margin))
+    write_straight_path(look, x.v, duration)
+    return True
 
 
 @compiled

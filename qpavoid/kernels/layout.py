@@ -178,7 +178,7 @@ class RowLayout(NamedTuple):
     """(n,) out: J⁺ẋ, see `kernels.tracking_law`; a velocity to follow in place of the tasks, where one is given."""
     # --- answer of the step
     v: Array
-    """(n,) out: velocity that may be commanded, where `control_step` returns SETTLED [rad/s or m/s]."""
+    """(n,) out: velocity that may be commanded, where `control_step` returns SETTLED or UNCLEAR [rad/s or m/s]."""
     summary: Any
     """(1,) out: numbers of the type `SUMMARY`."""
     identity: Array

@@ -21,7 +21,7 @@ from qpavoid.problem import Array, IntArray
 TOLERATED_DEPTH = 1e-3
 """Depth below the safety distance [m], or excess over a position limit [rad or m], that slows nothing down: noise and
 control periods lead that far."""
-SETTLED, UNSETTLED, TO_MEASURE, TO_SOLVE = range(4)
+SETTLED, UNSETTLED, TO_MEASURE, UNCLEAR, TO_SOLVE = range(5)
 """What `control_step` returns, and TO_SOLVE where it solves its QP first."""
 
 
@@ -55,8 +55,9 @@ def control_step(x: Any, q: Array, influence_distance: float, moving: bool, from
         is_measured: whether kinematics and distances are up to date.
 
     Returns:
-        SETTLED where `v` may be commanded as it is; UNSETTLED where other laws and checks decide; TO_MEASURE where the
-        distances of some near pairs have to be computed by other means first.
+        SETTLED where `v` may be commanded as it is; UNCLEAR where that needs a look ahead, and nothing else; UNSETTLED
+        where other laws and checks decide; TO_MEASURE where the distances of some near pairs have to be computed by
+        other means first.
     """
     if not is_measured:
         _, _, meeting = find_near_pairs(x, q, influence_distance)
@@ -71,7 +72,9 @@ def control_step(x: Any, q: Array, influence_distance: float, moving: bool, from
     A = x.A if from_tasks else x.identity
     v, is_solved = project(A, max(x.regularization, bent), x.v_tracking, x.J[:k], x.rhs[:k], x.lower, x.upper)
     x.v[:] = v
-    return SETTLED if is_solved and is_clear(x, q, v, k, influence_distance) else UNSETTLED
+    if not is_solved:
+        return UNSETTLED
+    return SETTLED if is_clear(x, q, v, k, influence_distance) else UNCLEAR
 
 
 @compiled
@@ -87,7 +90,9 @@ def settle_tracking(x: Any, k: int) -> int:
         return UNSETTLED
     if s.violation <= 0.0:
         x.v[:] = x.v_tracking
-        return SETTLED if s.is_clear else UNSETTLED
+        if s.is_clear:
+            return SETTLED
+        return UNSETTLED if is_too_near(x, k) else UNCLEAR
     return UNSETTLED if is_too_near(x, k) else TO_SOLVE
 
 

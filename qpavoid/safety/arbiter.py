@@ -40,7 +40,7 @@ class Arbiter:
         self.solver, self._rows, self._obstacles = solver, rows, obstacles
         self._reports_limits = rows.previous.needs_report
         self._v_shape = (settings.scene.robot.model.nv,)
-        self._braking = BrakingCheck(settings, rows, obstacles)
+        self.braking = BrakingCheck(settings, rows, obstacles)
         self.progress, self._shake_damping = ProgressMonitor(settings, rows), ShakeDamping(settings.dt)
         has_backup = settings.avoidance.backup and len(settings.scene.slots) > 0
         self.backup = BackupPlanner(settings, rows, obstacles) if has_backup else None
@@ -54,7 +54,7 @@ class Arbiter:
 
     def warm_up(self, q: Array) -> None:
         """Run all checks once at q (nq,), where a control step has been."""
-        self._braking.warm_up(q)
+        self.braking.warm_up(q)
         self.progress.warm_up()
 
     @property
@@ -186,7 +186,7 @@ class Arbiter:
             v = self.solver.low_effort(problem, slack)
             return v if v is None or limits is None else slowed(v, problem.v_stop, limits)[0]
 
-        result = self._braking.check(q, solution, problem, low_effort)
+        result = self.braking.check(q, solution, problem, low_effort)
         if result is None:
             return solution
         v, scale, violation, pair, distance = result

@@ -18,28 +18,24 @@ proof).
 from __future__ import annotations
 
 from collections.abc import Callable
-from math import floor, isnan
-from typing import NamedTuple
+from math import isnan
+from typing import Any, NamedTuple
 
 import numpy as np
 import pinocchio as pin
 
+from qpavoid import kernels
 from qpavoid.control.assembler import RowAssembler
 from qpavoid.control.distances import DistanceQuery
 from qpavoid.control.obstacles import ObstacleTracker
 from qpavoid.control.settings import ControlSettings
-from qpavoid.kernels import TOLERANCE, least_margin, speed_to_stop
+from qpavoid.kernels import LOOKED, TOLERANCE, least_margin, speed_to_stop
+from qpavoid.kernels.look_ahead import MAX_APPROACH_IN_VIOLATION, MAX_MARGIN, MIN_SPEED
+from qpavoid.kernels.structures import address
 from qpavoid.model.kinematics import ForwardKinematics
+from qpavoid.model.sample import STATE
 from qpavoid.problem import Array, Problem, Solution
 
-_MAX_APPROACH_IN_VIOLATION = 1e-5
-"""Approach per control step that a pair below its safety distance may make [m]: round-off of the row that parts it."""
-_MIN_STEP = 5e-3
-"""Least motion of the fastest point between two poses that are evaluated [m]; bounds their number."""
-_MAX_MARGIN = 0.04
-"""Distance beyond the safety distance up to which pairs are evaluated [m]: larger margins only set longer steps."""
-_MAX_POSES = 48
-"""Poses that are evaluated along one path, about [-]; bounds the time of a control step."""
 _MAX_STOP_STEPS = 200
 """Control steps of a braking trajectory that are followed [-]."""
 _REFINE_BELOW = 2e-3
@@ -48,8 +44,6 @@ _REFINEMENTS = 6
 """Evaluations per refinement [-]: they halve the interval each."""
 _REFINEMENT_ERROR = 1e-4
 """Difference of the least margins of one curved path between two control steps that counts as none [m]."""
-_MIN_SPEED = 1e-3
-"""Least speed by which steps along a curved path are scaled [m/s]."""
 _VIOLATION_TIME = 0.1
 """Time by which the violation of a row [m/s] counts as a distance [s], where no scale is clear: a stop lets an obstacle
 that approaches come nearer."""
@@ -84,9 +78,20 @@ class _Path(NamedTuple):
 
     def displacement(self, t: float) -> Array:
         """Return the displacement (nv,) from the start at time t."""
-        times, travel = self.times, self.travel
-        k = min(int(np.searchsorted(times, t, side="right")), len(times) - 1)
-        return np.asarray(travel[k] - (times[k] - t) / (times[k] - times[k - 1]) * (travel[k] - travel[k - 1]))
+        displacement = np.empty(self.travel.shape[1])
+        kernels.write_displacement(self.times, self.travel, t, displacement)
+        return displacement
+
+
+class _Least(NamedTuple):
+    """What came of looking along a path."""
+
+    margin: float
+    """Least margin of any pair [m]."""
+    pair: int
+    """That pair; -1 for none."""
+    distance: float
+    """Least distance of any pair, less the margins of stale obstacles [m]."""
 
 
 class _PathPoint(NamedTuple):
@@ -117,8 +122,44 @@ class BrakingCheck:
         self._budget = settings.budget
         self._has_accelerations = bool(np.isfinite(settings.bounds.acceleration).any())
         self._has_jerks = bool(np.isfinite(settings.bounds.jerk).any())
-        self._allowance = np.zeros(len(scene.pairs))
         self._distance_allowance = scene.distance_allowance(self._safety_distance)
+        self._query.set_influence_distance(self._safety_distance + MAX_MARGIN)
+        self.is_compiled = (
+            self._kinematics.is_compiled
+            and self._query.is_compiled
+            and self._model.nq == self._model.nv
+            and not (self._has_jerks or self._budget.is_limited)
+        )
+        """Whether kernels look along a path, but for pairs whose cores meet."""
+        self.look_arguments = self._lay_out(len(scene.slots), len(scene.pairs))
+        """Kernels of that, its memory, kinematics and distances."""
+        self._allowance = self.look_arguments[1].allowance
+
+    def _lay_out(self, obstacles: int, pairs: int) -> tuple[kernels.LookAheadCalls, kernels.LookAhead, Any, Any]:
+        """Lay out what the kernels take, for so many obstacles and pairs."""
+        query, kinematics, model = self._query.packed, self._kinematics, self._model
+        memory = kernels.LookAhead(
+            acceleration=self._bounds.acceleration,
+            allowance=np.zeros(pairs),
+            offset=self._distance_allowance,
+            states=np.zeros((obstacles, STATE)),
+            durations=np.full(obstacles, self._dt),
+            q=np.zeros(model.nq),
+            displacement=np.zeros((2, model.nv)),
+            times=np.zeros(2),
+            travel=np.zeros((2, model.nv)),
+            result=np.zeros(3),
+            dt=self._dt,
+            influence_distance=self._rows.influence_distance,
+            safety_distance=self._safety_distance,
+            least_distance=self._safety_distance - TOLERANCE,
+        )
+        calls = kernels.LookAheadCalls(
+            update_kinematics=address(kernels.update_kinematics, kinematics.packed, memory.q),
+            place_bodies=address(kernels.place_bodies, query, kinematics.joint_poses),
+            near_pairs=address(kernels.near_pairs, query, np.inf),
+        )
+        return calls, memory, kinematics.packed, query
 
     def warm_up(self, q: Array) -> None:
         """Evaluate a standstill at q (nq,), where a control step has been: no later one waits for the kernels."""
@@ -176,25 +217,27 @@ class BrakingCheck:
                 best, cost = BrakingResult(blend, scale, -least.margin, least.pair, least.distance), tried
         return best
 
-    def _least(self, q: Array, v: Array) -> _PathPoint:
-        """Return the point of least margin along the path of v (nv,) and its stop, with the least distance of all.
+    def _least(self, q: Array, v: Array) -> _Least:
+        """Return the least margin along the path of v (nv,) and its stop, with the least distance of all.
 
         Steps are such that no two bodies can meet in between, and no shorter than `_MIN_STEP`: the approach of a pair
         within one of those is of second order in it, as it was not too near at either end. A curved path may turn back
         in between, and before its end: there the least margin is refined.
         """
-        path, now, speed = self._path(q, v), self._now, max(float(self._now.arrays.speeds.max()), _MIN_SPEED)
+        path, now = self._path(q, v), self._now
+        if self.is_compiled:
+            calls, look, kinematics, later = self.look_arguments
+            if kernels.look_along(calls, look, now.packed, kinematics, later, q, path.times, path.travel) == LOOKED:
+                margin, pair, distance = look.result.tolist()
+                return _Least(margin, int(pair), distance)
+        speed = max(float(now.arrays.speeds.max()), MIN_SPEED)
         nearest = float(np.min(now.distances_of(now.pairs), initial=self._rows.influence_distance))
         nearest -= float(np.max(now.arrays.margin, initial=0.0))
         points = [_PathPoint(0.0, q, path.travel[0], nearest - self._safety_distance, -1, np.inf)]
         end = float(path.times[-1])
         while (t := points[-1].t) < end and (len(points) == 1 or not isnan(points[-1].margin)):
-            count = _MAX_POSES - len(points)
-            step = max(0.5 * min(max(points[-1].margin, 0.0), _MAX_MARGIN), _MIN_STEP) / speed
-            step = max(step, (end - t) / max(count, 1))
-            # the end of the control period is always evaluated, and the last of all poses is the end
-            last = path.period_end if len(points) == 1 else end
-            points.append(self._evaluate(path, points[-1], last if count <= 1 else min(t + step, last)))
+            t = kernels.next_pose_time(t, points[-1].margin, len(points), end, path.period_end, speed)
+            points.append(self._evaluate(path, points[-1], t))
         evaluated = points[1:]
         if self._has_jerks:
             evaluated = [*evaluated, self._evaluate(path, points[-2], 0.5 * (points[-2].t + points[-1].t))]
@@ -202,7 +245,7 @@ class BrakingCheck:
                 if previous.margin >= here.margin <= after.margin and here.margin < _REFINE_BELOW:
                     evaluated += self._refine(path, previous, here, after)
         least = evaluated[int(np.argmin([point.margin for point in evaluated]))]  # the first NaN, where there is one
-        return least._replace(distance=min(point.distance for point in evaluated))
+        return _Least(least.margin, least.pair, min(point.distance for point in evaluated))
 
     def _refine(self, path: _Path, previous: _PathPoint, here: _PathPoint, after: _PathPoint) -> list[_PathPoint]:
         """Return points around the least margin between two points."""
@@ -221,13 +264,10 @@ class BrakingCheck:
         """Return the path of v (nv,) and its stop: curved under jerk limits, else straight up to position limits."""
         stop = self._rows.stop(q, v)
         if stop is not None:
-            speed = max(float(self._now.arrays.speeds.max()), _MIN_SPEED)
+            speed = max(float(self._now.arrays.speeds.max()), MIN_SPEED)
             durations = np.maximum(stop.equivalent_time + stop.lateral_bound / speed, 1e-9)
             return _joined(durations, self._dt * stop.velocities, float(durations[0]))
-        n = self._stopping_time(v) / self._dt
-        m = floor(n)
-        # v leads as far in this time as v and its stop: dt Σ (1 - i/n), i = 0, …, m
-        duration = self._dt * (1.0 + m - (0.5 * m * (m + 1) / n if m else 0.0))
+        duration = kernels.stop_duration(v, self._bounds.acceleration, self._dt)
         if duration > self._dt and self._rows.leaves_position_limits(q, v, duration):
             steps = self._dt * self._steps_at_limits(q, v)
             return _joined(np.full(len(steps), self._dt), steps, self._dt)
@@ -265,13 +305,13 @@ class BrakingCheck:
         q = pin.integrate(self._model, previous.q, travel - previous.travel)
         self._kinematics.compute(q)
         query, now = self._query, self._now
-        query.compute(self._kinematics.joint_poses, self._safety_distance + _MAX_MARGIN)
+        query.compute(self._kinematics.joint_poses, self._safety_distance + MAX_MARGIN)
         pairs = query.pairs
         margin, pair, distance = least_margin(
             pairs, query.distances_of(pairs), now.distances_of(pairs), self._distance_allowance, self._allowance,
-            query.table.twist_row, query.arrays.margin, self._safety_distance - TOLERANCE, _MAX_APPROACH_IN_VIOLATION,
+            query.table.twist_row, query.arrays.margin, self._safety_distance - TOLERANCE, MAX_APPROACH_IN_VIOLATION,
         )  # fmt: skip
-        return _PathPoint(t, q, travel, margin if pair >= 0 else _MAX_MARGIN, pair, distance)
+        return _PathPoint(t, q, travel, margin if pair >= 0 else MAX_MARGIN, pair, distance)
 
 
 def _joined(durations: Array, steps: Array, period_end: float) -> _Path:

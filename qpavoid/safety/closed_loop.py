@@ -68,7 +68,8 @@ class ClosedLoop:
         """Record of the last `run`."""
         self.last: Solution | None = None
         """Solution of its last step, where there is more to say of it than its velocity."""
-        self._watch = watch.packed
+        self._watch, self._look = watch.packed, arbiter.braking.look_arguments
+        look_calls, look, kinematics, later = self._look
         setting = self._setting()
         self._calls = LoopCalls(
             sample_pieces=address(kernels.sample_pieces, setting.targets, 0.0, rows.targets),
@@ -78,7 +79,15 @@ class ClosedLoop:
             ),
             extend_paths=address(kernels.extend_paths, self._watch, tracker.prediction.pieces, _NONE, 0),
             comes_near=address(kernels.comes_near, self._watch, rows.query.packed, rows.v, _NONE, _NONE),
-        )
+            extrapolate_states=address(kernels.extrapolate_states, look.states, look.durations),
+            place_obstacles=address(
+                kernels.place_obstacles, later, setting.placed, look.states, tracker.current.margin
+            ),
+            look_along=address(
+                kernels.look_along, look_calls, look, rows.query.packed, kinematics, later, rows.q, look.times,
+                look.travel,
+            ),
+        )  # fmt: skip
 
     @staticmethod
     def suits(settings: ControlSettings, builder: ProblemBuilder, tasks: tuple[RowTask, ...]) -> bool:
@@ -112,7 +121,7 @@ class ClosedLoop:
             begin, check = done, done + arbiter.progress.steps_to_check
             end = min(most, check)
             done = run_periods(
-                calls, rows.packed, tracker.packed, self._watch, rows.q, setting, log, begin, end
+                calls, rows.packed, tracker.packed, self._watch, *self._look, rows.q, setting, log, begin, end
             )  # fmt: skip
             if done == begin:
                 break
@@ -141,6 +150,7 @@ class ClosedLoop:
             dt=self._dt,
             observes=len(tracker.moving) > 0,
             is_moving=query.is_moving,
+            looks=self._arbiter.braking.is_compiled,
             watches=self._arbiter.backup is not None and len(tracker.moving) > 0,
             largest_velocity=LARGEST_VELOCITY,
         )
