@@ -27,6 +27,7 @@ from qpavoid import (
     Status,
     build_scene,
     build_tasks,
+    kernels,
     make_solver,
 )
 from qpavoid.config import (
@@ -473,8 +474,9 @@ def test_attach_after_a_reset_takes_the_last_configuration(panda):
 @pytest.mark.parametrize("jerk", [None, 50.0])
 def test_step_computes_distances_a_bounded_number_of_times(tmp_path, jerk, monkeypatch):
     """Whatever moves: also at speeds at which little time is left between two poses that could meet."""
-    computed, compute = [], DistanceQuery.compute
+    computed, compute, look_along = [], DistanceQuery.compute, kernels.look_along
     monkeypatch.setattr(DistanceQuery, "compute", lambda self, *args: computed.append(1) or compute(self, *args))
+    monkeypatch.setattr(kernels, "look_along", lambda *args: computed.extend([1] * 49) or look_along(*args))
     obstacles = [Obstacle.at("ball", Sphere(radius=0.05), [0.3, 0.0, 0.0])]
     controller = make_controller(cartesian(tmp_path), obstacles, "z", limits=Limits(jerk=jerk))
     for speed in (0.0, 1.0, 999.0):
@@ -484,3 +486,13 @@ def test_step_computes_distances_a_bounded_number_of_times(tmp_path, jerk, monke
             controller.reset(np.array([0.9, 0.0, 0.0]))
             controller.step(np.zeros(3), obstacles={"ball": ball}, v=np.array([0.9, 0.0, 0.0]))
             assert 0 < len(computed) <= 1000
+
+
+@pytest.mark.parametrize("speed", [1e-3, 1.0, 1e6])
+def test_a_path_is_looked_along_in_49_poses_at_most(speed):
+    t, poses = 0.0, 0
+    while t < 2.0:
+        later = kernels.next_pose_time(t, 0.0, 1 + poses, 2.0, 0.01, speed)
+        assert t < later <= 2.0
+        t, poses = later, poses + 1
+    assert poses <= 49

@@ -164,7 +164,8 @@ def test_callers_know_a_large_kernel_that_another_process_compiled_after_them(si
     (large,) = tmp_path.glob("*/large.large-*")
     before = large.read_bytes()
     large.unlink()
-    run(site, tmp_path, SCRIPT + "from qpavoid.kernels.large import large\nlarge(3.0)")
+    others = "from numba import njit\nfor k in range(5):\n    njit(lambda x: x + k)(1)\n"
+    run(site, tmp_path, SCRIPT + others + "from qpavoid.kernels.large import large\nlarge(3.0)")
     assert large.read_bytes() != before
     for name, hits in (("caller", 1), ("other_caller", 0), ("other_caller", 1)):
         difference, found = run(site, tmp_path, CALL.format(name))[0]

@@ -18,7 +18,7 @@ the velocity of the solver is commanded, whose stop was looked ahead.
 from __future__ import annotations
 
 from collections.abc import Callable
-from math import ceil, inf
+from math import ceil
 
 import numpy as np
 import pinocchio as pin
@@ -30,7 +30,7 @@ from qpavoid.errors import NumericalError
 from qpavoid.kernels.rollout import FINISHED, HORIZON, PAUSED, TOUCH
 from qpavoid.problem import Array, Mask, Proximity
 from qpavoid.safety.approach import ApproachCheck, SettledSteps
-from qpavoid.safety.candidates import BackupPolicies, Command
+from qpavoid.safety.candidates import BackupPolicies, Command, least_score, not_worse
 from qpavoid.safety.rollout import LEAST_SCORE, ROUND_OFF, BackupRollouts, BackupScore, BackupTrajectory, Start
 
 _PERIOD_FRACTION = 0.128
@@ -53,8 +53,6 @@ _URGENT = 0.5
 _PORTION = 4
 """Poses that are evaluated, at 10 to 15 µs each, before a clock is read, where there is a budget [-]; of each control
 step, these at least."""
-_DISTANCE_TOLERANCE = 1e-6
-"""Difference of two clearances that counts as none [m]."""
 _CLOSE = 5e-3
 """Distance by which points of the robot may be off a trajectory that is followed because others are worse [m]."""
 _WITH_TASK, _ALONE = range(2)
@@ -290,7 +288,7 @@ class BackupPlanner:
             return False
         clearance = self._rollouts.clearance_from(candidate, after_task)  # the solver may lead elsewhere by now
         score = candidate.score._replace(clearance=min(clearance, candidate.score.clearance))
-        return clearance >= TOUCH and self._not_worse(score, backup.score)
+        return clearance >= TOUCH and not_worse(score, backup.score, self._rollouts.period, self._dt)
 
     def _begins_at(self, trajectory: BackupTrajectory, state: Start) -> bool:
         """Return whether a trajectory begins close to a state: limits and recovery may have changed commands."""
@@ -320,16 +318,8 @@ class BackupPlanner:
             prefix = np.concatenate((prefix, backup.v[len(prefix) :])) if number == 1 else prefix
         else:
             policy = self._rollouts.stop_policy if number == 2 else self._policies.sample()
-        self._rollouts.begin(start, policy, prefix, self._least_score(steps + 1))
-
-    def _least_score(self, steps: int) -> BackupScore:
-        """Return what a candidate has to exceed that goes on with the velocity of the solver some steps later."""
-        backup, sufficient = self._backup, self._rollouts.sufficient_score
-        if backup is None:
-            return LEAST_SCORE
-        if backup.score >= sufficient:
-            return sufficient._replace(clearance=sufficient.clearance - _DISTANCE_TOLERANCE)
-        return BackupScore(backup.score.time_to_contact - steps * self._dt, -inf)
+        least = least_score(backup, self._rollouts.sufficient_score, (steps + 1) * self._dt)
+        self._rollouts.begin(start, policy, prefix, least)
 
     def _begin_alone(self, command: Command, number: int, steps: int) -> None:
         """Begin a candidate with the beginning of the kept trajectory, or with all of it: then it replaces that."""
@@ -350,18 +340,6 @@ class BackupPlanner:
     def _steps_needed(self, poses: int) -> int:
         """Return the control steps after this one that a trajectory takes with so many poses in this one."""
         return max(0, ceil((self._candidate_poses - poses) / self._poses))
-
-    def _not_worse(self, later: BackupScore, now: BackupScore) -> bool:
-        """Return whether a trajectory that begins in the next control step is not worse than one that begins now.
-
-        Contact times are resolved to one period.
-        """
-        if later.time_to_contact > now.time_to_contact + self._rollouts.period:
-            return True
-        return (
-            later.time_to_contact + self._dt >= now.time_to_contact
-            and later.clearance >= now.clearance - _DISTANCE_TOLERANCE
-        )
 
 
 def _unless_equal(v: Array, other: Array) -> Array | None:

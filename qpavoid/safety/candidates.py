@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from math import inf
 from typing import NamedTuple
 
 import numpy as np
 
 from qpavoid.problem import Array
-from qpavoid.safety.rollout import BackupPolicy, Start
+from qpavoid.safety.rollout import LEAST_SCORE, BackupPolicy, BackupScore, BackupTrajectory, Start
 
+DISTANCE_TOLERANCE = 1e-6
+"""Difference of two clearances that counts as none [m]."""
 _HORIZONS = (0.2, 0.05, 0.5)
 """h of backup policies [s]: the most successful first."""
 _SAMPLES = 7
@@ -61,3 +64,35 @@ class BackupPolicies:
         h = _HORIZONS[random.integers(len(_HORIZONS))]
         direction, speed = random.normal(size=len(self._unbiased)), np.exp(random.uniform(*np.log(_BIAS_SPEEDS)))
         return BackupPolicy(h, speed / np.linalg.norm(direction) * direction)
+
+
+def least_score(backup: BackupTrajectory | None, sufficient: BackupScore, elapsed: float) -> BackupScore:
+    """Return what a candidate has to exceed that goes on with the velocity of the solver some time later.
+
+    Args:
+        backup: kept trajectory; None without one.
+        sufficient: score from which on a trajectory need not be improved.
+        elapsed: the time [s].
+    """
+    if backup is None:
+        return LEAST_SCORE
+    if backup.score >= sufficient:
+        return sufficient._replace(clearance=sufficient.clearance - DISTANCE_TOLERANCE)
+    return BackupScore(backup.score.time_to_contact - elapsed, -inf)
+
+
+def not_worse(later: BackupScore, now: BackupScore, period: float, dt: float) -> bool:
+    """Return whether a trajectory that begins in the next control step is not worse than one that begins now.
+
+    Contact times are resolved to one period.
+
+    Args:
+        later: score of the one in the next step.
+        now: score of the one now.
+        period: time between two decisions of a trajectory [s].
+        dt: control period [s].
+    """
+    if later.time_to_contact > now.time_to_contact + period:
+        return True
+    is_as_late = later.time_to_contact + dt >= now.time_to_contact
+    return is_as_late and later.clearance >= now.clearance - DISTANCE_TOLERANCE
